@@ -1,4 +1,4 @@
-"""An HTTP server on loopback for the tests of downloads."""
+"""A server in place of the internet, for the tests of downloads."""
 
 import http.server
 import re
@@ -13,7 +13,7 @@ class Server:
         self.ranges = []  # the Range header of each GET request, None where it has none
         self.break_after = None  # bytes of a response after which the connection is closed
         self.knows_ranges = True  # whether Range headers are honoured
-        self.chunked = False  # whether the server leaves out the length
+        self.chunked = False  # whether the length is left out, as in chunked responses
         outer = self
 
         class Handler(http.server.BaseHTTPRequestHandler):
@@ -54,11 +54,12 @@ class Server:
                     return
 
             def log_message(self, *_):
-                return
+                return  # nothing on stderr
 
         self.http = http.server.ThreadingHTTPServer(("127.0.0.1", 0), Handler)
         self.http.daemon_threads = True
         self.url = f"http://127.0.0.1:{self.http.server_port}"
+        # It looks every 0.02 s whether it is to stop.
         threading.Thread(target=self.http.serve_forever, args=(0.02,), daemon=True).start()
 
     def close(self) -> None:

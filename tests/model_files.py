@@ -34,16 +34,17 @@ def write_quad(
     lines = ["newmtl paint", "Kd {} {} {}".format(*colour), "Ks 0 0 0", "Ns 1", f"d {opacity}"]
     if texture is not None:
         lines.append(f"map_Kd {path.stem}.png")
-        order = [2, 1, 0, 3][: texture.shape[2]]
+        order = [2, 1, 0, 3][: texture.shape[2]]  # OpenCV writes BGR and BGRA
         cv2.imwrite(str(path.with_suffix(".png")), texture[..., order])
     path.with_suffix(".mtl").write_text("\n".join(lines) + "\n")
     return path
 
 
 def wedge(seat: float = 0.5) -> Mesh:
-    """An object without symmetry, like a chair: a seat, a back at the rear and one arm on the left.
+    """An object without symmetry, like a chair: a seat, a back at the rear, one arm on the left and
+    one leg at the front.
 
-    Front +x, up +z.
+    Front +x, up +z; `seat` is the height of the seat.
     """
     parts = (
         box((1.2, 1.0, 0.2), (0, 0, seat)),
@@ -67,7 +68,8 @@ def write_wedge(path: Path, seat: float = 0.5) -> Path:
 def studio() -> Room:
     """Return plain, light grey surroundings with one soft light, for pictures of single models."""
     plain = np.full((8, 8, 3), 0.55, np.float32)
-    light = np.array([0.6, 0.48, 0.64])
+    light = np.array([0.6, 0.48, 0.64])  # a unit vector, towards the front, the left and above
     camera = CheapCamera(exposure=0.42, noise=0.0, vignetting=0.0)
     size = np.array([14.0, 14, 12])
+    # The light is white, and has an angular radius of 0.15.
     return Room(size * [-1, -1, 0], size, (plain,) * 6, light, 0.15, np.ones(3), camera)

@@ -44,14 +44,15 @@ def with_large_weights(model: nn.Module) -> nn.Module:
 
 @dataclass(frozen=True)
 class Architecture:
-    """What the tests know of an architecture of Hugging Face: the tokens before the patches, and
-    the name of the norm before attention."""
+    """What the tests know of an architecture of Hugging Face."""
 
-    patch: int
+    patch: int  # pixels along a patch
     special: int  # tokens before the patches
-    norm: str = "layernorm_before"
-    settings: dict = field(default_factory=dict)
-    interpolates: bool = True  # if interpolate_pos_encoding=True; the others always do
+    norm: str = "layernorm_before"  # name of the norm before attention
+    settings: dict = field(default_factory=dict)  # of its configuration
+    # Whether it interpolates positions only if called with interpolate_pos_encoding=True; the
+    # others always do.
+    interpolates: bool = True
 
 
 _REGISTERS = {"num_register_tokens": 4}
@@ -76,6 +77,7 @@ def configuration(kind: str, patch: int = 16, **settings):
         "intermediate_size": 64,
     }
     vision = sizes | {"patch_size": patch, "image_size": 3 * patch} | settings
+    # The last two are refused by the library.
     if kind in ("clip", "siglip", "blip"):
         # Its text model is never run: any small vocabulary with three special tokens serves.
         text = sizes | {"vocab_size": 99, "bos_token_id": 1, "eos_token_id": 2, "pad_token_id": 0}

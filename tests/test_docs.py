@@ -16,7 +16,7 @@ import click
 import nbformat
 import numpy as np
 import pytest
-from test_importers import HALF_PIXEL, write_lists
+from captures import HALF_PIXEL, write_lists
 
 from tools import rooms
 from zsp_lite.benchmark.methods import GROUPS, METHODS

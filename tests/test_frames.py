@@ -6,13 +6,13 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+from captures import HALF_PIXEL, straight_places
 from co3d_folders import random_camera, seeds, sequence_data
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.random import default_rng
 from numpy.testing import assert_allclose, assert_array_equal
 from refusals import refused
-from test_importers import HALF_PIXEL, straight_places
 
 from zsp_lite import Camera, Frame
 from zsp_lite.data.depth import decode_depth, inpaint_depth, patch_points, unproject_depth

@@ -1,7 +1,6 @@
 """Captures written in every format from rendered views are read with the true cameras and depth,
 and imported."""
 
-import json
 import weakref
 from dataclasses import replace
 from pathlib import Path
@@ -9,94 +8,24 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from captures import edited, hairdryer_views, straight_places, write_lists, write_nerfstudio
 from numpy.testing import assert_allclose
 from refusals import refused
 from scipy.spatial import cKDTree
 
-from zsp_lite import Camera, Co3D, Frame, open_source
-from zsp_lite.course.synthetic.export import make_object
-from zsp_lite.course.synthetic.sequences import render_sequence
+from zsp_lite import Co3D, open_source
 from zsp_lite.data.check import check_folder
-from zsp_lite.data.writing import write_image, write_mask
+from zsp_lite.data.writing import write_image
 from zsp_lite.importers import open_capture
 from zsp_lite.importers.capture import CaptureFrame
 from zsp_lite.importers.convert import fuse, import_captures, import_source
 from zsp_lite.importers.masks import masks_from_box
-
-# From pixel centres at half integers to OpenCV's at integers.
-HALF_PIXEL = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
-METRES = 0.13  # per unit of the rendered world: the object is about 30 cm wide
-
-
-def hairdryer_views() -> list[Frame]:
-    """Eight views around a hairdryer, in metres."""
-    shape = make_object("hairdryer", 0, 4)
-    exact, _ = render_sequence(shape, np.random.default_rng(2), 8, 96)
-    frames = []
-    for view in exact:
-        camera = replace(view.camera, t=view.camera.t * METRES)
-        depth = (view.depth * METRES).astype(np.float32)
-        frames.append(
-            Frame(view.rgb, depth, view.mask.astype(np.float32), camera, f"{len(frames):04d}")
-        )
-    return frames
 
 
 @pytest.fixture(scope="module")
 def views():
     """The views, rendered once."""
     return hairdryer_views()
-
-
-def to_world(frame: Frame) -> np.ndarray:
-    """The pose of a frame's camera, camera-to-world (4, 4)."""
-    return np.linalg.inv(frame.camera.matrix)
-
-
-def write_depth16(path: Path, depth: np.ndarray) -> None:
-    """Write a depth map in metres as millimetres in 16 bits."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    assert cv2.imwrite(str(path), np.rint(1000 * depth).astype(np.uint16))
-
-
-def write_nerfstudio(folder: Path, frames: list[Frame]) -> None:
-    """Write a capture of nerfstudio."""
-    camera = frames[0].camera
-    (fx, fy), (cx, cy), (h, w) = camera.focal_length, camera.principal_point, camera.size
-    listed = []
-    for frame in frames:
-        write_image(folder / f"images/{frame.name}.jpg", frame.rgb, 95)
-        write_depth16(folder / f"depths/{frame.name}.png", frame.depth)
-        write_mask(folder / f"masks/{frame.name}.png", frame.mask)
-        pose = to_world(frame) @ np.diag([1.0, -1, -1, 1])  # OpenGL: +y up, looking along -z
-        listed.append(
-            {
-                "file_path": f"images/{frame.name}.jpg",
-                "depth_file_path": f"depths/{frame.name}.png",
-                "mask_path": f"masks/{frame.name}.png",
-                "transform_matrix": pose.tolist(),
-            }
-        )
-    content = dict(camera_model="OPENCV", fl_x=fx, fl_y=fy, cx=cx, cy=cy, w=w, h=h, frames=listed)
-    (folder / "transforms.json").write_text(json.dumps(content))
-
-
-def write_lists(folder: Path, frames: list[Frame], masks: bool = False) -> Path:
-    """Write a capture as lists of images, depth maps and poses; returns its folder."""
-    names, depths, poses = [], [], []
-    for frame in frames:
-        names.append(f"pictures/{frame.name}.jpg")
-        depths.append(f"z/{frame.name}.npy")
-        poses.append(" ".join(f"{value:.9f}" for value in to_world(frame)[:3].ravel()))
-        write_image(folder / names[-1], frame.rgb, 95)
-        (folder / "z").mkdir(exist_ok=True)
-        np.save(folder / depths[-1], np.rint(frame.depth * 1000).astype(np.uint16))
-        if masks:
-            write_mask(folder / f"masks/{frame.name}.png", frame.mask)
-    for name, rows in (("rgb.txt", names), ("depth.txt", depths), ("poses.txt", poses)):
-        (folder / name).write_text("\n".join(rows) + "\n")
-    np.savetxt(folder / "intrinsics.txt", frames[0].camera.K)
-    return folder
 
 
 WRITERS = {"nerfstudio": write_nerfstudio, "lists": write_lists}
@@ -144,22 +73,13 @@ def test_an_import_holds_a_few_frames_at_once(tmp_path, scan, monkeypatch, box):
         held.append(sum(image() is not None for image in images))
         return frame
 
-    load, images, held = CaptureFrame.load, [], []
+    load = CaptureFrame.load
+    images = []
+    held = []
     monkeypatch.setattr(CaptureFrame, "load", load_counted)
-    assert (
-        import_source(open_source(scan, box=box), tmp_path / "data", "teapot", "mine").frames == 8
-    )
+    done = import_source(open_source(scan, box=box), tmp_path / "data", "teapot", "mine")
+    assert done.frames == 8
     assert max(held) <= 3
-
-
-def straight_places(camera: Camera, distortion: list[float], undistort=cv2.undistortPoints):
-    """The place (x, y) of each pixel, and its place without the distortion by OpenCV; centres are
-    integers."""
-    rows, columns = np.indices(camera.size, np.float64)
-    places = np.stack([columns, rows], axis=-1)
-    K = camera.K - HALF_PIXEL
-    straight = undistort(places.reshape(-1, 1, 2), K, np.array(distortion), R=np.eye(3), P=K)
-    return places, straight.reshape(places.shape)
 
 
 def test_the_distortion_of_fisheye_cameras_is_corrected(tmp_path, views):
@@ -174,7 +94,7 @@ def test_the_distortion_of_fisheye_cameras_is_corrected(tmp_path, views):
         views[0].camera, [*distortion.values()], cv2.fisheye.undistortPoints
     )
     picture = np.zeros((height, width, 3))
-    level = 255 / width  # of a pixel
+    level = 255 / width  # per pixel
     picture[..., :2] = level * straight
     picture = np.rint(picture.clip(0, 255)).astype(np.uint8)
     write_image(folder / f"images/{views[0].name}.jpg", picture, quality=98)
@@ -194,6 +114,7 @@ def test_the_fused_cloud_lies_on_the_surface(views):
         seen.append(view.camera.unproject(pixels, view.depth[view.mask > 0]))
     seen = np.concatenate(seen)
     spread = seen.std(axis=0).mean()
+    # All but the outliers: 90 % of the points, in either direction.
     assert np.percentile(cKDTree(seen).query(points)[0], 90) < 0.1 * spread
     assert np.percentile(cKDTree(points).query(seen)[0], 90) < 0.2 * spread
     assert_allclose(np.linalg.norm(normals, axis=1), 1, atol=1e-3)
@@ -201,22 +122,8 @@ def test_the_fused_cloud_lies_on_the_surface(views):
 
 
 def replaced(name, content):
+    """Return a change of a folder: a file gets other content."""
     return lambda folder: (folder / name).write_text(content)
-
-
-def edited(*changes, encoding="utf-8", name="transforms.json"):
-    """Change transforms.json, or a file of another name, which replaces it if there is none."""
-
-    def apply(folder):
-        source = folder / (name if (folder / name).is_file() else "transforms.json")
-        content = json.loads(source.read_text())
-        for change in changes:
-            change(content)
-        source.unlink()
-        (folder / name).write_text(json.dumps(content), encoding=encoding)
-        return folder
-
-    return apply
 
 
 @pytest.mark.parametrize(
@@ -280,6 +187,7 @@ def test_a_single_frame_is_fused_and_what_one_of_many_frames_saw_is_left_out(vie
     near = np.where(on_object, 0.5 * view.depth, 0).astype(np.float32)
     points, *_ = fuse([*views, replace(view, depth=near)])
     _, depth = view.camera.project(points)
+    # The depth that the other frames contradict is half of that.
     assert depth.min() > 0.7 * view.depth[on_object].min()
 
 

@@ -42,7 +42,7 @@ def test_accepting_writes_the_similarity_of_the_picks_and_the_references_identit
     labelling.accept("a")
     labels = read_labels(root, "chair")
     assert_allclose(labels["a"].trans[:3, :3], turn, atol=1e-9)
-    # of the object, which the label maps to its centre
+    # The label maps the centre of the reference to its place on the object.
     centre = labelling.cloud("best")[0].mean(axis=0)
     assert_allclose(labels["a"].trans @ [*centre, 1], [*(1.3 * turn @ centre + 2), 1])
     assert_array_equal(labels["best"].trans, np.eye(4))
@@ -68,20 +68,13 @@ def test_invalid_categories_sequences_and_picks_are_refused(root):
     labelling = Labelling(root, "chair")
     pick_all(labelling, "best", corners())
     pick_all(labelling, "a", corners()[:3])
-    for call, message in (
-        (lambda: labelling.accept("a"), "a has 3 of 5 keypoints, expected all, at least 4"),
-        (
-            lambda: labelling.pick("none", (0, 0, 0)),
-            "sequence is 'none', expected one of best, a, b",
-        ),
-        (lambda: labelling.pick("a", (0, np.nan, 0)), "picks on a holds nan, expected finite"),
-        (
-            lambda: labelling.pick("a", (0, 1)),
-            "picks on a is .*, expected real numbers of shape .n, 3.",
-        ),
-        (lambda: Labelling(root, "stool"), "category is 'stool', expected one of"),
-    ):
-        refused(message, call)
+    refused("a has 3 of 5 keypoints, expected all, at least 4", labelling.accept, "a")
+    unknown = "sequence is 'none', expected one of best, a, b"
+    refused(unknown, labelling.pick, "none", (0, 0, 0))
+    refused("picks on a holds nan, expected finite", labelling.pick, "a", (0, np.nan, 0))
+    flat = "picks on a is .*, expected real numbers of shape .n, 3."
+    refused(flat, labelling.pick, "a", (0, 1))
+    refused("category is 'stool', expected one of", Labelling, root, "stool")
     assert read_labels(root, "chair") == {}
     assert_array_equal(Labelling(root, "chair").picks("a"), corners()[:3])
 
@@ -109,7 +102,7 @@ def test_a_large_residual_is_accepted_only_if_confirmed(root):
     labelling = Labelling(root, "chair")
     pick_all(labelling, "best", 4 * corners())
     assert labelling.doubt("a") == ""
-    pick_all(labelling, "a", 4 * corners("a"))
+    pick_all(labelling, "a", 4 * corners("a"))  # they differ from those of "best" by a shift
     assert labelling.doubt("a") == ""
     labelling.put("a", 4 * corners("a")[[1, 0, 2, 3, 4]])  # the first two are confused
     # The longest side of the cloud, without the points beyond the 1st and 99th percentile.
@@ -117,7 +110,7 @@ def test_a_large_residual_is_accepted_only_if_confirmed(root):
     distance = labelling.alignment("a").sim3.apply(labelling.picks("best")) - labelling.picks("a")
     expected = np.linalg.norm(distance, axis=1) / size
     rms = np.sqrt(np.square(expected).mean())
-    assert rms > MAX_RESIDUAL == 0.15
+    assert rms > MAX_RESIDUAL == 0.15  # 15 % below
     assert labelling.doubt("a") == (
         f"residual of {100 * rms:.0f} % of the object's size, above 15 %; the worst keypoint is "
         f"{labelling.names[expected.argmax()]} with {100 * expected.max():.0f} %"

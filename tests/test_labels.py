@@ -59,6 +59,7 @@ def test_labels_and_pairs_alone_are_imported(clone, root, run):
     assert contents(root) == before
 
 
+# Of sequence b, relative to a: a half turn about z.
 OTHER_LABEL = PoseLabel(np.diag([-1.0, -1, 1, 1]), "b", "a")
 
 
@@ -77,6 +78,7 @@ def test_nothing_is_written_if_one_file_is_bad(clone, root):
     before = contents(root)
     refused("contains more than tensors", import_labels, clone, root)
     assert contents(root) == before
+    # Nor if the labels that are there have another reference.
     write_label(root, "chair", PoseLabel(np.eye(4), "z", "z"))
     before = contents(root)
     refused("have reference sequences a, z, expected one", import_labels, clone, root)
@@ -142,7 +144,8 @@ def test_labels_are_transferred_between_worlds(tmp_path, run):
     assert run(f"{command} --replace").count("camera centres differ by 0.00 %") == 2
     labels = read_labels(tmp_path / "v2", "chair")
     assert_array_equal(labels["a"].trans, np.eye(4))
-    rotation, translation = labels["b"].trans[:3, :3], labels["b"].trans[:3, 3]
+    rotation = labels["b"].trans[:3, :3]
+    translation = labels["b"].trans[:3, 3]
     expected = worlds["b"].R @ trans[:3, :3] @ worlds["a"].R.T
     assert rotation_error(rotation, expected) < 0.01  # degrees, of the label's few decimals
     # Both labels map the centre of the reference cloud to the same point of the other object.
@@ -163,6 +166,7 @@ def test_worlds_that_differ_by_more_than_a_similarity_are_refused(tmp_path):
 def random_label(seed: int, name: str = "a") -> PoseLabel:
     """A label with a random pose of a sequence, relative to a sequence "zero"."""
     trans = np.eye(4)
+    # A random state has 32 bits at most.
     trans[:3, :3] = Rotation.random(random_state=seed % 2**31).as_matrix()
     trans[:3, 3] = default_rng(seed).normal(size=3)
     return PoseLabel(trans, name, "zero")

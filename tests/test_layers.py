@@ -1,5 +1,5 @@
-"""The structure of the code: no module imports from a layer above its own, and no room is above its
-limit of lines."""
+"""The structure of the code: no module imports from a layer above its own, and no room is larger
+than its limit."""
 
 import json
 import re
@@ -38,9 +38,8 @@ LAYERS = [
 # Packages that the course alone imports.
 OF_THE_COURSE = {"anywidget", "ipywidgets", "IPython", "jupyterquiz", "skimage"}
 LAYER_OF = {name: level for level, names in enumerate(LAYERS) for name in names.split()}
-
-
-MODULES, IMPORTS = modules(), [*imports()]
+MODULES = modules()
+IMPORTS = [*imports()]
 
 # What a lesson up to 06 never asks for, found by its name when it is used, so that lessons do not
 # stand on it.
@@ -68,7 +67,7 @@ def test_every_module_has_a_layer():
     assert {*map(layer_name, MODULES)} == set(LAYER_OF)
 
 
-def test_no_module_imports_from_a_higher_layer_or_from_another_name_of_its_own():
+def test_no_module_imports_from_a_higher_layer_or_from_another_name_in_its_own_layer():
     for module, imported, line in IMPORTS:
         package, _, name = imported.partition(".")
         if package == "zsp_lite" and name != "__version__":
@@ -106,6 +105,7 @@ def test_lessons_00_to_06_stand_on_at_most_6300_lines():
     for path in REPOSITORY.glob("notebooks/0[0-6]*.ipynb"):
         cells = json.loads(path.read_text("utf-8"))["cells"]
         lines = [line for cell in cells if cell["cell_type"] == "code" for line in cell["source"]]
+        # Without commands of IPython.
         code = "".join(line.rstrip("\n") + "\n" for line in lines if line[0] not in "%!")
         for name, _ in imported_names(code):
             todo |= home(name)
@@ -118,6 +118,7 @@ def test_lessons_00_to_06_stand_on_at_most_6300_lines():
         by_name = re.findall(r'resolve_name\("zsp_lite\.([\w.]+)', text)
         assert {*by_name} <= BY_NAME
     largest = sorted(found.items(), key=lambda one: -one[1])[:10]
+    # Far fewer lines would mean that imports are overlooked.
     assert 5000 < sum(found.values()) <= 6300, f"{sum(found.values())} lines; largest: {largest}"
     assert not BY_NAME & found.keys()
 

@@ -22,6 +22,7 @@ def test_objects_are_seen_from_the_same_side_by_the_true_rotations():
     assert list(shown) == list(truth)
     assert {picture.shape for picture in shown.values()} == {(224, 224, 3)}
     turned = dict(truth)
+    # By a half turn about the vertical.
     turned["seat_leon"] = np.diag([-1.0, -1, 1]) @ turned["seat_leon"]
     other = scan_pictures.alike(dataset, "car", turned, "suv")
     assert np.array_equal(other["suv"], shown["suv"])
@@ -33,8 +34,10 @@ def test_clouds_that_turn_are_light_and_hold_the_moved_points(frames, monkeypatc
     pages = []
     monkeypatch.setattr("IPython.display.display", pages.append)
     show_turning({"A": estimate}, "")
-    assert len(pages[0].data) < 100_000
-    moved = estimate.sim3.apply(object_cloud(estimate.reference_view, 1200)).T
+    assert len(pages[0].data) < 100_000  # characters, which a notebook stores
+    moved = estimate.sim3.apply(object_cloud(estimate.reference_view, most=1200)).T
+    # The longest string of the page holds the points, those of the moved cloud first.
     points = np.frombuffer(b64decode(max(pages[0].data.split('"'), key=len)), "<i2")
     drawn = points.reshape(-1, 3).T[:, : moved.shape[1]]
+    # Of x, y and z with those drawn, which have other units.
     assert np.corrcoef(moved, drawn).diagonal(3).min() > 0.9999

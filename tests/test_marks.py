@@ -18,12 +18,14 @@ from zsp_lite.scans.marks import Mark, category_axes, place_marks, read_front, w
 from zsp_lite.views import object_crop
 from zsp_lite.viz.category_sheet import objects_figure
 
+# Pixels in frame 0 of a scooter. The arrow is from its tail to its tip, parallel to the floor.
 SEAT = Mark("scooter", 0, 180.0, 114.0, "seat")
 ARROW = Mark("scooter", 0, 200.5, 124.5, "tail"), Mark("scooter", 0, 128.5, 76.5, "tip")
 
 
 @pytest.fixture(scope="module")
 def dataset():
+    """The sample data."""
     return Co3D("data_samples")
 
 
@@ -37,6 +39,7 @@ def alignment(dataset):
 
 @pytest.fixture(scope="module")
 def placed(dataset, alignment):
+    """The seat on both scooters."""
     return place_marks(alignment, dataset, "motorcycle", [SEAT])
 
 
@@ -63,7 +66,7 @@ def test_marks_are_written_for_other_programs(placed, dataset, alignment, tmp_pa
     (mark,) = json.loads(path.read_text())
     assert (mark["name"], mark["pixel"]) == ("seat", [180.0, 114.0])
     world = mark["objects"]["scooter2"]["world"]
-    points, _ = read_ply(tmp_path / "marks/scooter2.ply")
+    points, _ = read_ply(tmp_path / "marks/scooter2.ply")  # a ball around the place
     assert np.allclose(points.mean(axis=0), world, atol=0.01)
 
 
@@ -76,6 +79,7 @@ def test_a_place_is_seen_on_the_object_alone(placed, dataset):
 
 def test_an_object_without_any_place_has_no_file(placed, dataset, tmp_path):
     places = placed[0].places
+    # A place is found from a confidence of 0.5 on.
     missing = places | {"scooter2": replace(places["scooter2"], confidence=0.49)}
     write_marks([replace(placed[0], places=missing)], dataset, "motorcycle", tmp_path)
     assert [path.name for path in (tmp_path / "marks").iterdir()] == ["scooter.ply"]
@@ -83,6 +87,7 @@ def test_an_object_without_any_place_has_no_file(placed, dataset, tmp_path):
 
 def test_a_run_leaves_no_outputs_of_an_earlier_one(placed, alignment, tmp_path, run, monkeypatch):
     one = {"scooter2": alignment.objects["scooter2"]}
+    # The second run aligns one object of the two.
     answers = iter([alignment, replace(alignment, objects=one)])
     monkeypatch.setattr("zsp_lite.objects.align.align_category", lambda *_, **__: next(answers))
     monkeypatch.setattr("zsp_lite.scans.marks.place_marks", lambda *_: placed)
@@ -104,6 +109,7 @@ def test_a_run_leaves_no_outputs_of_an_earlier_one(placed, alignment, tmp_path, 
 
 @pytest.fixture(scope="module")
 def axes(dataset, alignment):
+    """The axes that the arrow gives."""
     return category_axes(alignment, "scooter", read_front(dataset, "motorcycle", *ARROW))
 
 
@@ -193,5 +199,6 @@ def test_wrong_marks_and_axes_are_refused_before_anything_is_computed(
 
 def test_axes_need_a_vertical_and_an_aligned_object(dataset, alignment, axes, monkeypatch):
     refused("sequence with the arrow is 'x'", category_axes, alignment, "x", axes.R)
+    # As where there is no floor.
     monkeypatch.setattr("zsp_lite.scans.marks.find_up", lambda frames: (None, ""))
     refused("no vertical, expected a scan with a floor", read_front, dataset, "motorcycle", *ARROW)

@@ -6,54 +6,24 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from refusals import refused
-from synthetic_views import AT_HOME, look_at, render
+from synthetic_views import ABOVE_FLOOR, object_on_floor, overlap
 
-from zsp_lite import Frame
 from zsp_lite.course.motorcycle import load_photograph
-from zsp_lite.data.depth import unproject_depth
 from zsp_lite.data.frames import mask_to_bbox
 from zsp_lite.importers.convert import scale_frame
 from zsp_lite.importers.masks import mask_flags, masks_from_box, masks_from_depth, separate_colours
 
-WALL, FLOOR = -3.0, -0.8  # along x, and below the object
-# Directions of cameras, from the middle of the object.
-DIRECTIONS = [(1, 0.2, 0.6), (0.4, 1, 0.5), (0.7, -0.8, 0.4), (1, 0.5, 1.5)]
-
-
-def object_on_floor(direction) -> tuple[Frame, np.ndarray]:
-    """A frame of the object of `synthetic_views`, in red on a grey floor before a wall, whose depth
-    has holes, and the true mask."""
-    camera = look_at(direction, 5.0)
-    seen = render(camera, AT_HOME)
-    truth = seen.mask > 0
-    # Directions of the rays in the world, with depth 1.
-    rays = unproject_depth(np.ones(camera.size), camera) @ camera.R
-    # The depth of the wall and of the floor.
-    depths = (np.array([WALL, FLOOR]) - camera.centre[[0, 2]]) / rays[..., [0, 2]]
-    depth = np.where(truth, seen.depth, np.where(depths > 0, depths, np.inf).min(axis=-1))
-    rng = np.random.default_rng(0)
-    holes = np.kron(rng.random((20, 20)) < 0.3, np.ones((7, 9)))  # of 7 x 9 pixels
-    depth = np.where((holes > 0) | (depth > 20), 0, depth)
-    rgb = np.where(truth[..., None], (200, 40, 40), 90) + rng.integers(-9, 9, (*camera.size, 3))
-    return Frame(rgb.astype(np.uint8), depth.astype(np.float32), None, camera), truth
-
-
-def overlap(mask, truth):
-    """Intersection over union of a mask and a boolean one."""
-    found = mask > 0.5
-    return (found & truth).sum() / (found | truth).sum()
-
 
 @pytest.mark.parametrize("count, unit", [(1, 1), (4, 1), (1, 1000)])
 def test_the_object_on_a_floor_is_found_without_a_box_in_any_unit_of_length(count, unit):
-    scenes = [object_on_floor(direction) for direction in DIRECTIONS[:count]]
+    scenes = [object_on_floor(direction) for direction in ABOVE_FLOOR[:count]]
     masked = masks_from_depth([scale_frame(frame, unit) for frame, _ in scenes])
     assert min(overlap(frame.mask, truth) for frame, (_, truth) in zip(masked, scenes)) > 0.95
     assert mask_flags(masked) == ()
 
 
 def test_depth_without_an_object_is_refused_and_no_depth_gives_an_empty_mask():
-    frame, truth = object_on_floor(DIRECTIONS[0])
+    frame, truth = object_on_floor(ABOVE_FLOOR[0])
     blind = replace(frame, depth=np.zeros_like(frame.depth))
     refused("no depth is known", masks_from_depth, [blind])
     flat = replace(frame, depth=np.full_like(frame.depth, 2))
@@ -65,22 +35,27 @@ def test_depth_without_an_object_is_refused_and_no_depth_gives_an_empty_mask():
     assert mask_flags([empty]) == mask_flags([empty, found]) == ()
 
 
-# Each spoils a mask whose object has a bounding box.
+# The next four spoil a mask in place, given the bounding box of its object.
 def in_the_corner(mask, *box):
+    """Add a corner of the image."""
     mask[:50, :50] = 1
 
 
 def in_two_parts(mask, top, left, height, width):
-    mask[top + height // 2 :][:8] = 0
+    """Remove eight rows in the middle of the object."""
+    middle = top + height // 2
+    mask[middle : middle + 8] = 0
 
 
 def around_the_object(mask, top, left, height, width):
+    """Take the surroundings in place of the object."""
     on_object = mask > 0
     mask[top - 8 : top + height + 8, left - 8 : left + width + 8] = 1
     mask[on_object] = 0
 
 
 def on_the_floor_too(mask, top, left, height, width):
+    """Add the floor around the lower end of the object."""
     mask[top + height - 15 : top + height + 25, left - 20 : left + width + 20] = 1
 
 
@@ -94,7 +69,7 @@ def on_the_floor_too(mask, top, left, height, width):
     ],
 )
 def test_masks_that_may_be_wrong_are_flagged_with_reason_and_number(spoil, sign):
-    (first, truth), (second, _) = (object_on_floor(direction) for direction in DIRECTIONS[:2])
+    (first, truth), (second, _) = (object_on_floor(direction) for direction in ABOVE_FLOOR[:2])
     good = masks_from_depth([first, second])
     assert mask_flags(good) == ()
     spoilt = truth.astype(np.float32)
@@ -105,14 +80,14 @@ def test_masks_that_may_be_wrong_are_flagged_with_reason_and_number(spoil, sign)
 
 
 def test_an_object_without_a_floor_is_found():
-    frame, truth = object_on_floor(DIRECTIONS[0])
+    frame, truth = object_on_floor(ABOVE_FLOOR[0])
     (found,) = masks_from_depth([replace(frame, depth=np.where(truth, frame.depth, np.float32(0)))])
     assert overlap(found.mask, truth) > 0.9
     assert mask_flags([found]) == ()
 
 
 def test_a_box_finds_the_object_and_stays_empty_where_it_is_not_seen():
-    (first, truth), (second, other) = (object_on_floor(direction) for direction in DIRECTIONS[:2])
+    (first, truth), (second, other) = (object_on_floor(direction) for direction in ABOVE_FLOOR[:2])
     box = mask_to_bbox(truth.astype(np.float32), padding=0.2)
     # The object is behind the camera.
     away = replace(second, camera=replace(second.camera, t=-second.camera.t))
@@ -132,7 +107,7 @@ def test_the_photographed_motorcycle_is_found():
 
 def test_separating_colours_on_a_smaller_copy_does_not_shift_the_mask():
     off = []
-    # The copy has a third of the rows: try all three positions.
+    # The copy has a third of the rows, 320: try all three positions.
     for first in (300, 301, 302):
         inside = np.zeros((960, 960), bool)
         inside[first : first + 360, first : first + 360] = True

@@ -25,10 +25,12 @@ seeds = st.integers(0, 2**32 - 1)
 
 
 def descriptors(keys: torch.Tensor) -> torch.Tensor:
+    """The normalised log-binned descriptors of all patches, (H * W, 17 * D)."""
     return F.normalize(log_bin(keys[None])[0].flatten(0, 1), dim=1)
 
 
 def feature_map(seed: int, grid=(9, 9), channels: int = 16, saliency=None) -> FeatureMap:
+    """Random features."""
     generator = torch.Generator().manual_seed(seed)
     keys = torch.randn(*grid, channels, generator=generator)
     saliency = torch.rand(grid, generator=generator) if saliency is None else saliency
@@ -36,8 +38,11 @@ def feature_map(seed: int, grid=(9, 9), channels: int = 16, saliency=None) -> Fe
 
 
 def cycles_by_loops(sim: np.ndarray, grid1, grid2, fg1, fg2, published=False) -> np.ndarray:
-    """Published cycles return to any patch but those of the first row and column, also off the
-    foreground."""
+    """Return -d(u, u') of equation 2, -inf off the foreground.
+
+    Published cycles return to any patch but those of the first row and column, also off the
+    foreground.
+    """
     result = np.full(grid1, -np.inf)
     for u in range(sim.shape[0]):
         v = int(np.argmax(sim[u]))
@@ -109,7 +114,7 @@ def test_without_binning_bare_keys_are_matched_and_clustered():
 
 def test_without_kmeans_the_k_best_cycles_are_taken_ties_by_similarity():
     ref, target = feature_map(2), feature_map(3)
-    everything = match(ref, target, k=81, kmeans=False)
+    everything = match(ref, target, k=81, kmeans=False)  # all of 9 x 9 patches
     keys = list(zip(everything.distance, -everything.similarity))
     assert keys == sorted(keys)
     assert_array_equal(match(ref, target, k=7, kmeans=False).reference, everything.reference[:7])
@@ -167,7 +172,7 @@ def test_clusters_are_computed_by_one_thread(monkeypatch):
 
     threads = set()
     monkeypatch.setattr("sklearn.cluster.KMeans", Observed)
-    matching._cluster(np.eye(8), 4, 0)
+    matching._cluster(np.eye(8), k=4, seed=0)
     assert threads == {1}
 
 
@@ -178,13 +183,14 @@ ON_FIRST = torch.arange(12) % 4 > 0
 ON_SECOND = torch.arange(15) % 3 > 0
 
 
-def test_the_transport_plan_is_pots():
+def test_the_transport_plan_is_that_of_pot():
     uniform = [np.full(n, 1 / n) for n in SIMILARITIES.shape]
     cost = 1 - SIMILARITIES.double()
     # So many steps that both have converged.
     steps = 5000
     expected = ot.sinkhorn(*uniform, cost.numpy(), reg=0.05, numItermax=steps, stopThr=1e-14)
-    assert_allclose(sinkhorn(cost, 0.05, steps).numpy(), expected, rtol=0, atol=1e-9)
+    plan = sinkhorn(cost, regularisation=0.05, steps=steps)
+    assert_allclose(plan.numpy(), expected, rtol=0, atol=1e-9)
 
 
 def test_the_dual_softmax_is_the_product_of_two_softmaxes():

@@ -17,6 +17,7 @@ from zsp_lite.course.synthetic.textures import srgb_to_linear
 from zsp_lite.course.training.renders import framed_camera
 
 STUDIO = studio()
+# A texture of 2 x 2 pixels.
 CHECKS = np.array([[[255, 0, 0], [0, 255, 0]], [[0, 0, 255], [255, 255, 255]]], np.uint8)
 
 
@@ -106,6 +107,7 @@ def test_an_unusable_file_is_refused_with_its_reason(tmp_path, monkeypatch, name
     monkeypatch.setattr(meshes, "MAX_FACES", 2)
     monkeypatch.setattr(meshes, "MAX_BYTES", 1000)
     if content == "quad":
+        # clear.obj is transparent, the other one lacks its texture.
         write_quad(tmp_path / name, CHECKS, opacity=float(name != "clear.obj"))
         (tmp_path / "bare.png").unlink(missing_ok=True)
     else:
@@ -143,7 +145,7 @@ def test_a_folder_without_models_and_a_wrong_list_are_refused(tmp_path, folder, 
 
 def render(mesh, camera, samples=1):
     """A picture of a mesh on the floor of the studio, by so many rays per side of a pixel."""
-    return MeshScene(mesh, STUDIO, 0, samples=samples).render(camera)
+    return MeshScene(mesh, STUDIO, seed=0, samples=samples).render(camera)
 
 
 def canonical(path):
@@ -153,6 +155,7 @@ def canonical(path):
 
 def framed(mesh, azimuth, elevation, size):
     """A camera that frames a mesh; angles in degrees."""
+    # Without roll, at a distance of 8.
     pose = orbit_pose(*np.radians([azimuth, elevation]), 0, 8, np.zeros(3))
     return framed_camera(mesh.vertices, *pose, size, margin=1.5)
 
@@ -220,4 +223,4 @@ def test_light_falls_through_a_hole_in_a_texture(holed):
     # Points behind the middle and behind the side of the square, with light from the front.
     points = np.array([[-3.0, 0, 0], [-3.0, 0.9 * holed.vertices[:, 1].max(), 0]], np.float32)
     light = np.tile(np.float32([1, 0, 0]), (2, 1, 1))
-    assert MeshScene(holed, STUDIO, 0)._visible_share(points, light).tolist() == [1, 0]
+    assert MeshScene(holed, STUDIO, seed=0)._visible_share(points, light).tolist() == [1, 0]

@@ -23,8 +23,7 @@ from zsp_lite.data.labels import read_labels
 from zsp_lite.data.pairs import shipped_pairs
 from zsp_lite.io.files import REPOSITORY
 
-FRAMES, SIZE = 5, 64
-SETTINGS = {"frames": FRAMES, "seed": 3, "image_size": SIZE}
+SETTINGS = {"frames": 5, "seed": 3, "image_size": 64}
 
 
 @pytest.fixture(scope="module")
@@ -89,6 +88,7 @@ def test_labels_map_the_front_of_the_reference_to_the_front_of_every_object(data
 def test_the_data_folder_has_evaluation_pairs_with_true_matches(data):
     dataset, _ = data
     pairs = shipped_pairs(dataset, "chair", 3)
+    # As many as an export writes for each category of models.
     assert len(pairs) == len(shipped_pairs(dataset, "chair", 1)) == 20
     assert ground_truth_pair(dataset, pairs[0]).valid.sum() > 20
 
@@ -103,7 +103,7 @@ def test_complete_sequences_stay_and_turned_models_are_rendered_again(
     before = read_labels(out, "chair")["low"].trans
     export_models(folder, out, **SETTINGS)
     assert not record.called
-    # of `high` alone: models.json orients the other one
+    # Of `high` alone: models.json orients the other one.
     export_models(folder, out, **SETTINGS, front="+x")
     assert [call.args[1] for call in record.call_args_list] == ["high"]
     assert not np.allclose(read_labels(out, "chair")["low"].trans, before)
@@ -134,7 +134,7 @@ def test_the_code_of_the_page_on_own_models_writes_labels_that_align_the_objects
     (code,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
     names = {}
     exec(code, names)
-    elsewhere = np.eye(4)
+    elsewhere = np.eye(4)  # a quarter turn and a shift
     elsewhere[:3] = [[0, -1, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3]]
     whole = sequence_data("first")
     recordings = []

@@ -1,5 +1,5 @@
-"""The package: public names, files, the wheel and its use without the repository, where samples are
-made."""
+"""The package: public names, version, files, the wheel and its use without the repository, where
+samples are made."""
 
 import os
 import re
@@ -11,6 +11,7 @@ from email.parser import Parser
 from pathlib import Path
 
 import pytest
+import yaml
 from refusals import refused
 
 import zsp_lite
@@ -35,6 +36,13 @@ def test_every_promised_name_is_there_after_an_import_without_torch():
     )
     code += f"\nfor name in {names}: operator.attrgetter(name)(zsp_lite)"
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_the_version_is_the_same_everywhere():
+    citation = yaml.safe_load((REPOSITORY / "CITATION.cff").read_text())
+    (latest, *_) = re.findall(r"^## (\S+)", (REPOSITORY / "CHANGELOG.md").read_text(), re.MULTILINE)
+    assert zsp_lite.__version__ == str(citation["version"]) == latest
+    assert citation["preferred-citation"]["title"] in (REPOSITORY / "README.md").read_text()
 
 
 @pytest.fixture(scope="module")
@@ -67,7 +75,7 @@ def test_the_wheel_has_the_package_and_nothing_else(wheel):
     assert {path.relative_to(REPOSITORY).as_posix() for path in files} <= set(names)
     assert fields["Name"] == "zsp-lite"
     assert fields["License-Expression"] == "MIT"
-    assert wheel.stat().st_size < 14e6
+    assert wheel.stat().st_size < 14e6  # bytes, of which the network may have 12e6
 
 
 @pytest.mark.slow
@@ -80,6 +88,7 @@ def test_the_wheel_makes_its_samples_in_an_empty_folder(wheel, tmp_path):
     subprocess.run([*install, "--target", str(site), str(wheel)], check=True)
     readme = (REPOSITORY / "README.md").read_text("utf-8")
     (example, *_) = re.findall(r"```python\n(.*?)```", readme, re.DOTALL)
+    # The demo with few and small samples, then the example.
     code = (
         f"import zsp_lite; assert zsp_lite.__file__.startswith({str(site)!r})\n"
         "from dataclasses import replace; from zsp_lite.course.synthetic.export import PRESETS\n"
@@ -115,6 +124,7 @@ def test_samples_are_made_in_the_cache_and_completed_after_an_interruption(tmp_p
     monkeypatch.setenv("ZSP_LITE_CACHE", str(tmp_path / "cache"))
     calls = []
 
+    # A renderer that is interrupted the first time. It writes down which files it finds.
     def export(preset, out):
         calls.append((preset, sorted(path.name for path in out.glob("made *"))))
         (out / f"made {len(calls)}").touch()

@@ -1,3 +1,5 @@
+"""Evaluation pairs: sampled ones, those of published files, and a folder's own."""
+
 from itertools import permutations
 
 import numpy as np
@@ -17,6 +19,7 @@ NAMES = ["s3", "s1", "s2"]
 
 @pytest.fixture(scope="module")
 def dataset(tmp_path_factory):
+    """Two categories of three labelled sequences and one without a label, of 12 frames each."""
     root = tmp_path_factory.mktemp("data")
     for category in ("chair", "lamp"):
         write_category(root, category, [*NAMES, "unlabelled"], frames=12)
@@ -56,7 +59,8 @@ def test_references_go_round_and_every_other_sequence_and_frame_gets_its_turn(da
 def test_target_frames_are_evenly_spaced_round_the_sequence(dataset, n_targets):
     for pair in sample_pairs(dataset, "chair", 20, n_targets, seed=3):
         assert len(set(pair.target_frames)) == n_targets
-        steps = np.diff([*pair.target_frames, pair.target_frames[0] + 12]) % 12
+        steps = np.diff([*pair.target_frames, pair.target_frames[0] + 12])
+        # 12 / n, rounded down or up. A single frame is 12 from itself, once round.
         assert set(steps % 12) <= {12 // n_targets % 12, -(-12 // n_targets) % 12}
 
 
@@ -127,7 +131,7 @@ def test_a_folders_own_pairs_are_found(tmp_path, caplog):
     write_category(tmp_path, "chair", "ab")
     dataset = Co3D(tmp_path)
     assert shipped_pairs(dataset, "chair", 2) == []
-    # the last is the first
+    # The fifth pair is the first one again.
     pairs = [Pair("chair", "a", number % 4, "b", (0, 2)) for number in range(5)]
     for n in (3, 5):
         write_published_pairs(pairs_path(tmp_path, "chair", n, 2), pairs[:n], dataset)
@@ -144,6 +148,7 @@ def test_a_folders_own_pairs_are_found(tmp_path, caplog):
     [
         (
             {"reference_frame_id": 48},
+            # four sequences of 12 frames
             "frame id 48 is not of s1, expected a position in the list of 48 frames",
         ),
         ({"all_target_id": []}, "all_target_id"),

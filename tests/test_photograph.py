@@ -5,6 +5,7 @@ import json
 
 import numpy as np
 import pytest
+import skimage.data
 from numpy.random import default_rng
 from numpy.testing import assert_allclose
 from synthetic_views import AT_HOME, ELSEWHERE, CoordinateBackbone, around, look_at, render
@@ -30,8 +31,6 @@ FLOOR = np.s_[450:, :]  # the lowest rows, which the motorcycle does not reach
 @pytest.fixture(scope="module")
 def frame():
     """The photograph with depth in metres."""
-    import skimage.data
-
     rgb, _, disparity = skimage.data.stereo_motorcycle()
     return motorcycle_frame(rgb, disparity)
 
@@ -50,9 +49,9 @@ def test_the_mask_holds_the_seat_and_both_wheels_and_neither_the_floor_nor_the_b
 def test_up_is_the_normal_of_the_floor_and_front_is_parallel_to_it(frame):
     known = frame.depth[FLOOR] > 0
     points = unproject_depth(frame.depth, frame.camera)[FLOOR][known]
-    normal, _ = fit_plane(points, 0.01)
-    # y points down in cameras: the normal that points up has a negative y. In degrees.
-    assert vector_angle(-np.sign(normal[1]) * normal, UP) < 2
+    normal, _ = fit_plane(points, threshold=0.01)  # metres
+    # y points down in cameras: the normal that points up has a negative y.
+    assert vector_angle(-np.sign(normal[1]) * normal, UP) < 2  # degrees
     assert abs(vector_angle(FRONT, UP) - 90) < 1
 
 
@@ -65,8 +64,6 @@ def test_the_photograph_is_scaled_as_scenes_of_co3d(frame):
 
 
 def test_depth_follows_from_the_disparity_by_the_calibration(frame):
-    import skimage.data
-
     *_, disparity = skimage.data.stereo_motorcycle()
     row, col = 330, 390  # on the engine
     x, _, z = frame.camera.unproject_camera(np.array([col + 0.5, row + 0.5]), frame.depth[row, col])
@@ -137,11 +134,12 @@ def test_a_folder_without_synthetic_motorcycles_gives_no_result(ellipsoids):
 def test_the_demo_begins_with_the_credited_photograph(
     motorcycles, photograph, tmp_path, monkeypatch, loaded, run
 ):
+    # Without the other pairs of the demo, for speed.
     monkeypatch.setattr("zsp_lite.course.demo.demo_pairs", lambda dataset: [])
     text = run(f"demo --data {motorcycles.root} --out {tmp_path}")
     page = (tmp_path / "report.html").read_text("utf-8")
     assert text.index("Photographed motorcycle") < text.index("One pair per category")
-    assert text.count("│ verified ") == 2
+    assert text.count("│ verified ") == 2  # rows of the table, one for each foreground
     assert MODELS_NOTE in " ".join(text.split())
     assert "Which way does a real motorcycle stand?" in page
     assert "Middlebury" in page

@@ -8,12 +8,21 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+from captures import write_depth16, write_lists, write_nerfstudio
 from numpy.testing import assert_allclose, assert_array_equal
 from PIL import Image, ImageOps
 from refusals import refused
-from synthetic_views import AT_HOME, ELSEWHERE, CoordinateBackbone, around, look_at, render
-from test_importers import write_lists, write_nerfstudio
-from test_masks import DIRECTIONS, object_on_floor, overlap
+from synthetic_views import (
+    ABOVE_FLOOR,
+    AT_HOME,
+    ELSEWHERE,
+    CoordinateBackbone,
+    around,
+    look_at,
+    object_on_floor,
+    overlap,
+    render,
+)
 
 from zsp_lite import estimate_pose, open_source
 from zsp_lite.data.arrays import camera_from_pose
@@ -32,7 +41,7 @@ from zsp_lite.metrics import rotation_error
 RADIUS = np.hypot(*np.mgrid[-16:16, -20:20])  # pixels from the middle, (32, 40)
 DISC = RADIUS < 9  # the object
 RING = (RADIUS < 11) & ~DISC  # another object, or pixels that were left undecided
-DEEP = DISC[..., None]
+DEEP = DISC[..., None]  # with an axis of channels
 SMOOTH = cv2.GaussianBlur(255 * DISC.astype(np.uint8), (9, 9), 0)
 # The palette of Pascal VOC: black, red, green; the last colour is that of undecided pixels.
 VOC = [0, 0, 0, 128, 0, 0, 0, 128, 0] + [224, 224, 192] * 253
@@ -54,6 +63,7 @@ MASKS = {
     "palette of two.png": (2 * DISC + RING, 2),
     "labels.png": (2 * DISC + 5 * RING, 2),
     "colours.png": (DEEP * [90, 0, 0] + RING[..., None] * [0, 90, 200], 1),
+    # Any colours; the fourth channel is the object.
     "cut out.png": np.dstack([np.arange(1280).reshape(32, 40, 1).repeat(3, 2) % 256, 255 * DISC]),
     "alpha.png": np.where(DEEP, [255] * 4, [255, 255, 255, 0]),
 }
@@ -81,7 +91,7 @@ def test_every_kind_of_mask_shows_the_object(tmp_path, name):
 
 
 # A depth map in metres, (6, 8), with unknown values in the first half of its first row: as
-# floating-point numbers, and as millimetres in 16 bits.
+# floating-point numbers, and as millimetres in 16 bits. The nines only fill the row.
 UNKNOWN = np.arange(48).reshape(6, 8) < 4
 DEPTH = np.linspace(0.5, 3, 48, dtype=np.float32).reshape(6, 8)
 FLOAT = np.where(UNKNOWN, np.float32([0, np.nan, np.inf, -1, 9, 9, 9, 9]), DEPTH)
@@ -134,8 +144,7 @@ def write_photograph(path, frame, tag, stored=True):
     depth, mask = frame.depth, frame.mask
     if stored:
         depth, mask = as_stored(depth, tag), as_stored(mask, tag)
-    millimetres = np.rint(1000 * depth).astype(np.uint16)
-    cv2.imwrite(str(path.with_name(f"{path.stem}_depth.png")), millimetres)
+    write_depth16(path.with_name(f"{path.stem}_depth.png"), depth)
     write_mask(path.with_name(f"{path.stem}_mask.png"), mask)
     return path
 
@@ -149,7 +158,7 @@ def write_photograph(path, frame, tag, stored=True):
         (3, 1 << 31, bytes(4)),
     ],
 )
-def test_an_orientation_that_is_none_is_ignored(tmp_path, tag):
+def test_a_damaged_orientation_is_ignored(tmp_path, tag):
     # The directory of EXIF names itself as the next one.
     directory = b"Exif\0\0II*\0\x08\0\0\0\x01\0" + struct.pack("<HHI4sI", ORIENTATION, *tag, 8)
     jpeg = cv2.imencode(".jpg", np.zeros((8, 8, 3), np.uint8))[1].tobytes()
@@ -164,7 +173,7 @@ def test_a_photograph_is_upright_with_its_depth_mask_and_camera_in_either_form(
     tmp_path, portrait, tag, form
 ):
     path = write_photograph(tmp_path / "a.jpg", portrait, tag, form == "stored")
-    # The principal point as displayed, and where it is in the stored image.
+    # The principal point as displayed, and the pixel that shows it in the stored image.
     x, y = 74, 99
     spot = np.zeros((180, 140))
     spot[y, x] = 1
@@ -181,6 +190,7 @@ def test_a_photograph_is_upright_with_its_depth_mask_and_camera_in_either_form(
         (frame,) = open_source(path, given, orientation=form if ambiguous else None).load([0])
         assert_allclose(frame.depth, portrait.depth, atol=6e-4)  # millimetres
         assert_array_equal(frame.mask, portrait.mask)
+        # A pixel is turned above, a point by the library: they are up to a pixel apart.
         assert_allclose(frame.camera.K, [[190, 0, x], [0, 190, y], [0, 0, 1]], atol=1.01)
         assert_allclose(frame.camera.R, np.eye(3), atol=1e-12)
         assert np.abs(frame.rgb.astype(int) - portrait.rgb).mean() < 3
@@ -188,7 +198,7 @@ def test_a_photograph_is_upright_with_its_depth_mask_and_camera_in_either_form(
 
 def test_a_capture_of_turned_photographs_keeps_its_world_and_refuses_mirrored_ones(tmp_path):
     views = around(AT_HOME, 2)
-    write_nerfstudio(tmp_path, views)  # The cameras are those of the stored pixels.
+    write_nerfstudio(tmp_path, views)  # the cameras are those of the stored pixels
     quarter_turn, mirrored = 6, 5
     for view, tag in zip(views, (quarter_turn, mirrored), strict=True):
         path = tmp_path / f"images/{view.name}.jpg"
@@ -199,7 +209,7 @@ def test_a_capture_of_turned_photographs_keeps_its_world_and_refuses_mirrored_on
     frame = turned.load()
     assert frame.depth.shape == (180, 140)
     # The pixel (x, y) of the upright image is (y, 139 - x) of the stored one.
-    y, x = np.argwhere(frame.mask > 0)[::97].T
+    y, x = np.argwhere(frame.mask > 0)[::97].T  # some pixels of the object
     points = frame.camera.unproject(np.stack([x, y], -1) + 0.5, frame.depth[y, x])
     pixels, _ = views[0].camera.project(points)
     assert_allclose(pixels, np.stack([y, 139 - x], -1) + 0.5, atol=0.01)
@@ -240,6 +250,7 @@ def test_intrinsics_of_another_image_or_unit_are_questioned_and_corrected(values
         assert re.search(message, doubt) if message else not doubt
 
 
+# Options of an import to a new data folder.
 NEW = "--category lump --sequence one --root imported"
 
 
@@ -248,7 +259,7 @@ def on_floor(tmp_path, monkeypatch):
     """Four frames of an object on a floor, with true masks, written to `tmp_path`, the working
     folder, as lists without masks."""
     frames = []
-    for number, direction in enumerate(DIRECTIONS):
+    for number, direction in enumerate(ABOVE_FLOOR):
         frame, truth = object_on_floor(direction)
         frames.append(replace(frame, mask=truth.astype(np.float32), name=str(number)))
     write_lists(tmp_path, frames)
@@ -303,7 +314,7 @@ def test_depth_of_another_shape_is_refused_and_depth_too_far_for_any_scene_unkno
     cv2.imwrite(str(depth), np.ones((90, 90), np.uint16))
     message = r"= \(180, 140\) as the image, or smaller with its aspect ratio"
     refused(message, source.load, [0])
-    source = open_source(path, INTRINSICS, depth_unit=1e4)
+    source = open_source(path, INTRINSICS, depth_unit=1e4)  # 2 becomes 20 km
     cv2.imwrite(str(depth), np.full((90, 70), 2, np.uint16))
     assert not source.load([0])[0].depth.any()
 

@@ -32,11 +32,13 @@ METHOD = ZeroShotPose(CoordinateBackbone())
 
 @pytest.fixture(scope="module")
 def reference(frames):
+    """The frame of the reference object."""
     return frames[0]
 
 
 @pytest.fixture(scope="module")
 def targets(frames):
+    """Five frames of the target object."""
     return frames[1:]
 
 
@@ -48,6 +50,7 @@ def seen(frames):
 
 @pytest.fixture(scope="module")
 def estimate(reference, targets):
+    """The estimate from all of them."""
     return METHOD.estimate(reference, targets)
 
 
@@ -97,7 +100,7 @@ class NoisyBackbone(CoordinateBackbone):
         return FeatureMap(
             keys,
             found.saliency * torch.from_numpy(rng.uniform(0.5, 1, found.grid)).float(),
-            keys[7, 7],
+            keys[7, 7],  # any vector does for the whole image
         )
 
 
@@ -106,10 +109,12 @@ BASE = ZeroShotPose(NoisyBackbone(grid=14), k=30, trials=8, threshold=0.1)
 
 @pytest.fixture(scope="module")
 def views(reference, targets):
+    """The reference and three target views, with noisy features."""
     return BASE.views([reference, *targets[::2]])
 
 
 def estimate_noisy(views, **settings) -> PoseEstimate:
+    """The estimate from noisy views by `BASE` with other settings."""
     return replace(BASE, **settings).estimate_from_views(views[0], views[1:])
 
 
@@ -154,7 +159,7 @@ def test_a_setting_reaches_its_stage_and_no_earlier_one(
 
 def test_the_range_of_scales_reaches_ransac(views, monkeypatch):
     free = estimate_noisy(views, trials=1000)
-    monkeypatch.setattr(pipeline, "SCALE_RANGE", (1.2, 1.25))
+    monkeypatch.setattr(pipeline, "SCALE_RANGE", (1.2, 1.25))  # the true scale is 1.15
     bounded = estimate_noisy(views, trials=1000)
     assert free.sim3.scale < 1.2 <= bounded.sim3.scale <= 1.25
     assert not bounded.flags
@@ -269,14 +274,14 @@ def test_a_patch_is_foreground_from_a_quarter_of_its_area(reference):
     mask = np.zeros(reference.mask.shape, np.float32)
     mask[:71, :90] = 1  # just over a quarter of 140 x 180 pixels
     assert patch_mask(replace(reference, mask=mask), (1, 1)).item()
-    mask[69:] = 0
+    mask[69:] = 0  # just under a quarter
     assert not patch_mask(replace(reference, mask=mask), (1, 1)).item()
 
 
 def test_too_few_matches_fall_back_to_the_best_view_with_a_flag(seen):
     reference, *targets = seen
     two = torch.zeros_like(reference.foreground)
-    two[14, 14:16] = True
+    two[14, 14:16] = True  # patches in the middle of 28 x 28
     estimate = METHOD.estimate_from_views(replace(reference, foreground=two), targets)
     assert "best view" in estimate.note
     assert "at least 4" in estimate.note

@@ -19,7 +19,7 @@ def test_patches_of_maps_are_marked_at_their_centres():
     (axis,) = plots.show_maps([IMAGE], {"key": np.zeros(GRID)}).axes
     lines = [*plots.circle_patch(axis, (2, 1), GRID), *plots.circle_patch(axis, (1, 3), GRID, "*")]
     marks = [(line.get_marker(), *line.get_xydata()[0]) for line in lines]
-    assert marks == [("o", 30, 50), ("*", 70, 30)]
+    assert marks == [("o", 30, 50), ("*", 70, 30)]  # x and y of (row, column)
 
 
 def test_lines_join_the_centres_of_matched_patches_and_those_of_outliers_are_dashed():

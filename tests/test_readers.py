@@ -16,11 +16,7 @@ import lzfse
 import numpy as np
 import pandas as pd
 import pytest
-from numpy.testing import assert_allclose, assert_array_equal
-from refusals import refused
-from scipy.spatial.transform import Rotation
-from synthetic_views import look_at
-from test_importers import (
+from captures import (
     HALF_PIXEL,
     edited,
     hairdryer_views,
@@ -29,6 +25,10 @@ from test_importers import (
     write_lists,
     write_nerfstudio,
 )
+from numpy.testing import assert_allclose, assert_array_equal
+from refusals import refused
+from scipy.spatial.transform import Rotation
+from synthetic_views import look_at
 
 from zsp_lite import open_source
 from zsp_lite.data.frames import with_images
@@ -38,8 +38,8 @@ from zsp_lite.importers.capture import find_masks, trusted
 from zsp_lite.importers.sources import spread_views
 from zsp_lite.importers.unpacked import Video
 
-# Frames are of a rendered hairdryer, and all writers take a folder and frames; they return the path
-# of the scan. OPENGL turns OpenCV's axes of a camera into OpenGL's.
+# All writers take a folder and frames; they return the path of the scan.
+# OpenGL's axes of a camera in OpenCV's: x is the same, y and z are opposite.
 OPENGL = np.diag([1.0, -1, -1, 1])
 CERTAIN = 2  # the highest level of confidence, of 0 to 2
 # Columns of Stray Scanner; the next two are empty.
@@ -50,7 +50,7 @@ OTHER_FOCUS = np.diag([1.1, 1.1, 1])  # times a camera's matrix
 
 @pytest.fixture(scope="module")
 def views():
-    """Four frames."""
+    """Four frames of a rendered hairdryer."""
     return hairdryer_views()[:4]
 
 
@@ -289,6 +289,7 @@ def test_odometry_without_a_row_or_a_column_is_refused(tmp_path, views):
     refused("odometry.csv has no column qz, qw, expected frame, x", open_capture, path)
 
 
+# The times of the four images of the video, in units of 1 / 60 s; the last may be late.
 @pytest.mark.parametrize("steps, last", [([0, 1, 4, 5], "000005"), ([0, 1, 2, 3], "000003")])
 def test_images_that_a_video_lacks_are_counted_and_found_by_time(
     tmp_path, monkeypatch, steps, last
@@ -297,6 +298,7 @@ def test_images_that_a_video_lacks_are_counted_and_found_by_time(
     path = write_stray(tmp_path, views)
     write_video(path / "rgb.mp4", [view.rgb for view in views[:2] + views[4:]])
     assert_allclose(Video(path / "rgb.mp4").times(), 1000 / 30 * np.arange(4))
+    # OpenCV writes no video with a gap.
     monkeypatch.setattr(Video, "times", lambda _: [1000 / 60 * step for step in steps])
     source = open_source(path)
     flags = " ".join(source.flags(source.load([0])))
@@ -328,6 +330,7 @@ RELATIVES = {
         lambda c: c.update(camera_angle_x=2 * np.arctan(c.pop("w") / 2 / c.pop("fl_x"))),
         lambda c: [c.pop(name) for name in ("fl_y", "h", "cx", "cy")],
     ),
+    # The first of the two scales counts.
     "depth_path": edited(
         each(lambda f: f.update(depth_path=f.pop("depth_file_path"))),
         lambda c: c.update(integer_depth_scale=0.001, depth_unit_scale_factor=5),
@@ -419,7 +422,7 @@ def test_masks_belong_to_images_by_relative_path_then_name_then_stem(tmp_path):
         "b/1.jpg": None,
         "a/2.jpg": tmp_path / "2.jpg.png",
         "a/3.jpg": tmp_path / "3.png",
-        # Two images have this name: it tells them not apart.
+        # Two images have this name: it does not tell them apart.
         "a/4.jpg": None,
         "b/4.jpg": None,
     }
@@ -500,7 +503,7 @@ def test_a_file_that_is_no_capture_is_answered_with_what_it_is(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "write, change",
+    "write_scan, change",
     [
         (write_open3d, edited(lambda c: c.update(coeffs=DISTORTION), name="intrinsic.json")),
         (
@@ -513,8 +516,8 @@ def test_a_file_that_is_no_capture_is_answered_with_what_it_is(tmp_path):
         ),
     ],
 )
-def test_files_carry_the_distortion(tmp_path, views, write, change):
-    write(tmp_path, views)
+def test_files_carry_the_distortion(tmp_path, views, write_scan, change):
+    write_scan(tmp_path, views)
     change(tmp_path)
     for frame in open_capture(tmp_path).frames:
         assert_array_equal(frame.distortion, DISTORTION)
@@ -522,6 +525,7 @@ def test_files_carry_the_distortion(tmp_path, views, write, change):
 
 @pytest.mark.parametrize(
     "name, size, message",
+    # Zeros of 60 kB are compressed to a hundred bytes.
     [("../../climbs", 0, "path ../../climbs leads"), ("a", 60_000, "1.. bytes unpack to 60,000")],
 )
 def test_a_zip_that_is_malicious_or_large_is_refused(tmp_path, monkeypatch, name, size, message):
@@ -568,12 +572,13 @@ LEVELS = np.where(WRONG, 1, CERTAIN).astype(np.uint8)
 DARK = np.where(DISC, 1, LEVELS).astype(np.uint8)
 
 
-@pytest.mark.parametrize("values", [[0, 1, 2], [0, 127, 255]])  # those of Apple, of Polycam
-def test_thin_bands_of_middle_confidence_are_dropped_and_surfaces_kept(values):
-    values = np.array(values, np.uint8)
+# The three levels as Apple and as Polycam store them.
+@pytest.mark.parametrize("stored", [[0, 1, 2], [0, 127, 255]])
+def test_thin_bands_of_middle_confidence_are_dropped_and_surfaces_kept(stored):
+    stored = np.array(stored, np.uint8)
     assert WRONG.mean() > 0.01
-    assert_array_equal(trusted(values[LEVELS]), ~WRONG)
-    assert trusted(values[DARK])[DISC & ~WRONG].mean() > 0.95
+    assert_array_equal(trusted(stored[LEVELS]), ~WRONG)
+    assert trusted(stored[DARK])[DISC & ~WRONG].mean() > 0.95
 
 
 def test_a_confidence_map_has_the_size_of_the_depth(tmp_path, views):

@@ -9,9 +9,9 @@ from functools import partial
 import numpy as np
 import open3d as o3d
 import pytest
+from captures import METRES, write_depth16
 from numpy.testing import assert_allclose
 from refusals import refused
-from test_importers import METRES, write_depth16
 
 from zsp_lite import Frame, open_source
 from zsp_lite.course.synthetic.export import make_object
@@ -32,10 +32,11 @@ INTRINSICS = (131.25, 131.25, 80.0, 60.0)
 @pytest.fixture(scope="module")
 def views():
     """Once around a chair on a rug, and a little more, in metres."""
-    mesh = make_object("chair", 0, 1)
+    mesh = make_object("chair", 0, 1)  # index and seed
     rng = np.random.default_rng([1, 7])
-    scene = MeshScene(mesh, random_room(rng, 0.3), rng, samples=1)
+    scene = MeshScene(mesh, random_room(rng, turn=0.3), rng, samples=1)
     frames = []
+    # From somewhat above, with a little roll, at a distance of 7.5 times METRES.
     for azimuth in np.radians(np.arange(0, 376, 8)):
         R, t = orbit_pose(azimuth, 0.45, 0.05 * np.sin(azimuth), 7.5, box_centre(mesh.vertices))
         camera = Camera(R, t, np.array(INTRINSICS[:2]), np.array(INTRINSICS[2:]), (120, 160))
@@ -89,6 +90,7 @@ def test_poses_around_an_object_are_found_within_2_degrees_and_4_centimetres(tmp
 def test_a_turn_whose_loops_do_not_close_is_flagged(tmp_path, views, monkeypatch):
     registration = o3d.pipelines.registration
 
+    # Loops are the uncertain edges of the graph.
     def without_loops(graph, *_):
         kept = [edge for edge in graph.edges if not edge.uncertain]
         graph.edges = registration.PoseGraphEdgeVector(kept)
@@ -114,6 +116,7 @@ def test_frames_that_are_dark_or_damaged_are_left_out(tmp_path, views):
     (tmp_path / "rgb/000005.jpg").write_bytes(b"damaged")
     (tmp_path / "depth/000006.png").unlink()
     source = open_recording(tmp_path)
+    # Frames 3, 5 and 6 are bad.
     assert errors(source, [*views[:3], views[4]])[0] < 1
     left_out = " ".join(source.left_out)
     for reason in (
@@ -141,6 +144,7 @@ def test_the_unit_of_depth_scales_the_poses(tmp_path, views):
 def test_of_many_frames_only_some_are_tracked(tmp_path, views, monkeypatch):
     monkeypatch.setattr("zsp_lite.importers.recordings._MOST", 3)
     write(tmp_path, views[:6])
+    # Every second one of six.
     assert errors(open_recording(tmp_path), views[:6:2])[0] < 1
 
 
@@ -179,4 +183,5 @@ def test_recorders_of_open3d_and_redwood_need_no_option(tmp_path, views):
 def test_poses_of_other_formats_are_not_found_again(tmp_path, views, sign):
     write(tmp_path, views[:1])
     (tmp_path / sign).touch()
+    # The second message is for scene_camera.json, of BOP.
     refused("but no poses|lacks scene_gt.json", recognise, tmp_path)

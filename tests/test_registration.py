@@ -13,6 +13,7 @@ from zsp_lite.importers.registration import misregistration
 pytestmark = pytest.mark.slow
 
 SAMPLES = Co3D(sample_data())
+# One sequence of each category.
 SCANS = [(c, max(SAMPLES.frame_numbers(c))) for c in SAMPLES.categories()]
 
 
@@ -28,6 +29,7 @@ def moved(frame: Frame, shift: int, scale: float) -> Frame:
 def test_the_shift_and_the_scale_of_depth_are_measured(scan):
     frames = [SAMPLES.load(one) for one in SAMPLES.frames(*scan)[::3]]
     assert misregistration(frames) == ""
+    # The way back: 15 pixels to the left, measured in steps of 2, or a scale of 1 / 0.8.
     for shift, scale, found in ((15, 1.0, "-1[46], [02].* 1.00"), (0, 0.8, "0, [024].* 1.25")):
         line = misregistration([moved(frame, shift, scale) for frame in frames])
         assert re.search(f"moved by about {found}", line)

@@ -22,9 +22,7 @@ from zsp_lite.io.files import REPOSITORY
 from zsp_lite.metrics import rotation_error
 from zsp_lite.scans.pair_result import run_pair
 from zsp_lite.viz.plots import show_residuals
-from zsp_lite.viz.report import (
-    write_report,
-)
+from zsp_lite.viz.report import write_report
 
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("closed_figures")]
 
@@ -93,7 +91,7 @@ def test_the_page_has_the_errors_and_the_numbers_of_the_hypotheses(results, text
 
 
 def test_the_page_says_where_the_answer_is_one_of_two(results, text, tmp_path):
-    assert "One of two" not in text  # With perfect features the answer is certain.
+    assert "One of two" not in text  # with perfect features the answer is certain
     estimate = results[0].estimates["verified"]
     uncertain = replace(results[0], estimates={"verified": replace(estimate, one_of_two=True)})
     page = write_report(tmp_path / "report.html", [uncertain], "name", "data").read_text("utf-8")
@@ -108,9 +106,11 @@ def test_lines_end_at_the_partners_and_a_fit_marks_its_inliers(results):
     views = estimate.reference_view, estimate.target_views[estimate.view]
     (fitted,) = show_residuals(views, (source, target), {"estimate": estimate.sim3}).axes
     pixels, _ = views[1].frame.camera.project(views[1].frame.camera.to_world(target))
+    # The threshold of RANSAC is 0.2.
     inliers = np.linalg.norm(estimate.sim3.apply(source) - target, axis=1) < 0.2
     _, lines, discs = fitted.collections
     assert_allclose(discs.get_offsets(), pixels[inliers])
+    # Every third outlier has a line.
     assert len(lines.get_segments()) == len(pixels[~inliers][::3])
 
 

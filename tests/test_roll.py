@@ -1,7 +1,5 @@
-"""A reference turned in the image:
-
-`upright=False` finds the turn, and the pose is that of the turned image.
-"""
+"""A reference whose image lies on its side: `upright=False` finds the turn that sets it up, and
+the pose is that of the turned image."""
 
 import numpy as np
 import pytest
@@ -20,7 +18,7 @@ class UprightBackbone(CoordinateBackbone):
     The object's z is blue and points up.
     """
 
-    images = 0  # that features were computed of
+    images = 0  # number of images that features were computed of
     salient = True  # whether turned images have a foreground
 
     def features(self, image):
@@ -69,7 +67,7 @@ def test_a_turned_reference_stands_up_and_the_pose_is_that_of_the_turned_image(
     assert_array_equal(found.reference.rgb, frames[0].rgb)
     assert_allclose(found.reference.camera.matrix, frames[0].camera.matrix, atol=1e-9)
     lying = estimate_pose(rolled, frames[1:4], solver, backbone=backbone, references=1)
-    # the features are noise
+    # The features are noise, and all that the paper's solver has; the other one has shapes, too.
     assert solver == "verified" or rotation_error(lying.estimate.sim3.R, truth.R) > 20
 
 
@@ -88,6 +86,7 @@ def test_the_command_tries_the_turns_on_demand(monkeypatch, ellipsoids, tmp_path
     monkeypatch.setattr("zsp_lite.objects.estimate.write_pair", lambda *_: [])
     folder = ellipsoids.root / "ellipsoid"
     line = f"estimate {folder}/a {folder}/b --targets 2 --solver paper --out {tmp_path}"
+    # The reference and two target views; then the reference in four turns, and in the best one.
     for option, images in (("", 3), ("--not-upright", 8)):
         UprightBackbone.images = 0
         run(f"{line} {option}")

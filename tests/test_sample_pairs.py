@@ -35,15 +35,15 @@ def dataset():
     return zsp_lite.Co3D(REPOSITORY / "data_samples")
 
 
-def test_it_is_one_page():
+def test_the_one_page_version_is_one_page():
     lines = Path(minimal.__file__).read_text("utf-8").splitlines()
     assert len(lines) <= 195  # two columns of a page
-    # It shows the whole method: nothing of the library computes a part of it.
+    # The page shows the whole method: nothing of the library computes a part of it.
     imports = [line for line in lines if "zsp_lite" in line]
     assert imports == ["from zsp_lite.errors import InputError"]
 
 
-def test_it_gives_the_librarys_view_matches_inliers_and_pose(dataset):
+def test_the_one_page_version_gives_the_librarys_view_matches_inliers_and_pose(dataset):
     method = zsp_lite.ZeroShotPose(load_backbone())
     for category in labelled_categories(dataset):
         first, others = dataset.load_pair(shipped_pairs(dataset, category, 3)[0])
@@ -62,7 +62,7 @@ def test_it_gives_the_librarys_view_matches_inliers_and_pose(dataset):
         assert_allclose(pose.matrix, expected.sim3.matrix, rtol=1e-6, atol=1e-9)
 
 
-def test_too_few_matches_are_refused():
+def test_the_one_page_version_refuses_too_few_matches():
     # Without saliency no patch is on the object.
     saliency = np.zeros((4, 4))
     crop = minimal.Crop(np.ones((4, 4, 2)), saliency, np.ones((32, 32), np.float32), np.eye(3))
@@ -84,7 +84,7 @@ def test_views_and_poses_are_the_stored_ones(dataset):
 
 
 def test_the_shipped_backbone_is_small_and_in_half_precision():
-    assert TINY.stat().st_size <= 12e6
+    assert TINY.stat().st_size <= 12e6  # bytes
     with safe_open(TINY, "pt") as file:
         assert {str(file.get_tensor(name).dtype) for name in file.keys()} == {"torch.float16"}
 

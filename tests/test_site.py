@@ -22,6 +22,7 @@ REPOSITORY = Path(__file__).parents[1]
 NOTEBOOKS = sorted((REPOSITORY / "notebooks").glob("*.ipynb"))
 EXERCISES = sorted((REPOSITORY / "notebooks/exercises/source").glob("*/*.ipynb"))
 DECKS = sorted((REPOSITORY / "docs/slides").glob("*.md"))
+pytestmark = pytest.mark.slow  # the site is built once, for all tests of this file
 
 
 class Page:
@@ -54,9 +55,6 @@ def pages(site):
 def page_of(source: Path) -> str:
     """The path in the site of the page of a source."""
     return str(source.relative_to(REPOSITORY).with_suffix(".html"))
-
-
-pytestmark = pytest.mark.slow  # the site is built once, for all tests of this file
 
 
 def test_every_link_and_anchor_leads_somewhere_and_every_page_is_reached(site, pages):
@@ -112,6 +110,7 @@ def test_a_notebook_shows_its_stored_pictures_its_drawings_and_what_it_printed(p
     assert [text for text in shown if text in texts] == texts
     drawings = re.findall(r"!\[([^]]+)\]\(", "\n".join(cell.source for cell in cells))
     assert all(" ".join(text.split()) in shown for text in drawings)
+    # What is folded: checks, and outputs that answer a prediction.
     checks = [cell for cell in cells if "checks" in cell.metadata.get("tags", [])]
     answers = [cell for cell in answering_cells(nbformat.read(path, 4)) if cell.outputs]
     assert page.folded == len(checks) + len(answers)
@@ -144,6 +143,7 @@ def test_exercises_are_offered_without_solutions_hidden_tests_and_guides(site, p
         hidden = re.compile(r"### BEGIN (?:SOLUTION|HIDDEN TESTS)\n(.*?)### END", re.DOTALL)
         shown = hidden.sub("", source)
         lines = {line.strip() for part in hidden.findall(source) for line in part.splitlines()}
+        # Short lines may stand elsewhere by chance.
         secrets = {line for line in lines if len(line) > 25 and line not in shown}
         copy = nbformat.read(site / "run" / path.relative_to(REPOSITORY), 4)
         for text in (pages[page_of(path)].text, "\n".join(cell.source for cell in copy.cells)):

@@ -47,7 +47,8 @@ def folder(tmp_path_factory) -> Path:
 def chair(request):
     """A chair as recorded by a sensor, with its exact pose, scale and views."""
     index = request.param
-    name, key = sequence_name(SEED, "chair", index), stable_hash(f"{SEED}/chair/{index}")
+    name = sequence_name(SEED, "chair", index)
+    key = stable_hash(f"{SEED}/chair/{index}")
     mesh = make_object("chair", index, SEED)
     # `record_sequence` draws the views with the same generator.
     views, _ = render_sequence(mesh, default_rng([key, 1]), FRAMES, SIZE)
@@ -93,12 +94,13 @@ def test_masks_are_accurate_to_two_pixels(chair):
         distance = cv2.distanceTransform(inside, cv2.DIST_L2, 5)
         distance += cv2.distanceTransform(1 - inside, cv2.DIST_L2, 5)
         wrong = (frame.mask > 0.5) != view.mask
-        assert distance[wrong].max() <= 2.5
+        assert distance[wrong].max() <= 2.5  # half a pixel more: distances are between centres
 
 
 def test_a_flat_object_seen_edge_on_has_finite_depth(chair):
     *_, views = chair
     edge_on = replace(views[0], mask=np.zeros_like(views[0].mask))
+    # With holes in 0.3 of the object and in 0.2 of the floor.
     assert np.isfinite(stereo_depth(edge_on, 0.3, 0.2, default_rng(0))).all()
 
 
@@ -195,9 +197,12 @@ def test_lines_on_the_floor_tell_the_heading_of_the_room_and_not_of_the_object(m
     errors = []
     for k in range(24):
         mesh = make_object(sorted(CATEGORIES)[k % len(CATEGORIES)], k, SEED)
+        # Five frames of 128 x 128 pixels.
         data, pose, _ = record_sequence(mesh, "", k, 5, 128)
+        # That of the object, and that of the room.
         headings = [direction(turn, 0) for turn in (0, room.call_args.args[1])]
         errors.append(distances_to_lines(data.frames, headings @ pose[:3, :3].T))
+    # Of 24 headings, those less than 5 degrees off. Errors are at most 45: by chance, one in nine.
     of_object, of_room = np.sum(np.less(errors, 5), 0)
     assert of_room >= 21
-    assert of_object <= 4  # by chance one in nine
+    assert of_object <= 4

@@ -39,7 +39,6 @@ from zsp_lite.viz.reliability import reliability
 
 seeds = st.integers(0, 2**31)
 
-
 METHOD = ZeroShotPose(CoordinateBackbone(), solver="verified")
 
 
@@ -58,7 +57,7 @@ def scene(views):
 
 
 def featureless_scene(views):
-    """A scene in which the features say nothing."""
+    """A scene in which the features say nothing: all 28 x 28 patches are equally similar."""
     return build_scene(views[0], views[1:], [torch.zeros(784, 784)] * len(views[1:]), [])
 
 
@@ -76,6 +75,7 @@ def test_suppression_keeps_the_best_of_each_neighbourhood(seed):
     rng = default_rng(seed)
     rotation = rotation_matrices(torch.tensor(rng.normal(0, 0.5, (12, 3)), dtype=torch.float32))
     score = torch.tensor(rng.normal(size=12))
+    # At least 25 degrees apart; as many as there are, 12.
     kept = non_maximum_suppression(rotation, score, 25.0, 12)
     apart = rotation_angles(rotation, rotation)
     assert (score[kept].diff() <= 0).all()
@@ -143,11 +143,12 @@ def test_matches_with_outliers_propose_the_true_pose(seed):
     )
     source = rng.normal(size=(30, 3))
     target = pose.apply(source)
-    target[:12] = rng.normal(size=(12, 3))
     # The first 12 of 30 matches are outliers.
+    target[:12] = rng.normal(size=(12, 3))
     points = [torch.tensor(part, dtype=torch.float32) for part in (source, target)]
     found = poses_from_matches(*points, default_rng(seed))
     assert rotation_error(found.rotation[0], pose.R) < 1
+    # At most six proposals, at least 20 degrees apart.
     assert len(found) <= 6
     assert (rotation_angles(found.rotation, found.rotation).fill_diagonal_(180) >= 20).all()
 
@@ -159,7 +160,7 @@ def test_of_matches_in_one_place_no_pose_is_proposed():
 
 def test_a_view_rotation_sees_the_reference_from_that_view(scene):
     found = poses_from_views(scene)
-    assert len(found) == 3 + 11
+    assert len(found) == 3 + 11  # one for each view, and turns of the first by 30 to 330 degrees
     for view in range(3):
         assert_allclose(scene.to_sim3(found, view, view).R, np.eye(3), atol=1e-5)
 
@@ -196,8 +197,10 @@ def test_terms_of_two_points_in_three_views_by_hand(scene):
     found = _averages(
         scene, tuple(part[None] for part in projection), rows, 1, torch.tensor([1.0, 3.0])
     )
-    near = np.exp(-0.5)
+    near = np.exp(-0.5)  # weight of a point 0.25, one standard deviation, behind the surface
     s = scene.similarity.numpy()
+    # A sum of similarities is divided by that of the weights and 0.5: by 2.3 for the first point.
+    # The points have a quarter and three quarters of the weight.
     expected = [
         (s[0, 3] + 0.8 * s[0, 4]) / 2.3 / 4 + 0.75 * near * s[1, 5] / (near + 0.5),
         1 / 4 + 0.75 * near,
@@ -208,12 +211,13 @@ def test_terms_of_two_points_in_three_views_by_hand(scene):
 
 
 def test_the_truth_scores_above_other_poses(scene, truth):
+    # Nearly half turns about the axes, and smaller ones.
     angles = torch.tensor([[3.1, 0, 0], [0, 3.1, 0], [0, 0, 3.1], [0.7, 0, 0], [0, -0.7, 0]])
     turns = rotation_matrices(angles)
     others = Poses(truth.scale.expand(5), turns @ truth.rotation, truth.translation.expand(5, 3))
     terms = score_terms(scene, concatenate([truth, others]))
     assert int(ScoreCoefficients().score(terms).argmax()) == 0
-    # Similarities and overlaps are highest, the others lowest.
+    # Similarities and overlaps are highest, silhouettes and free space lowest.
     assert (terms[0, [0, 1, 4, 5]] > terms[1:, [0, 1, 4, 5]]).all()
     assert terms[0, [2, 3, 6, 7]].max() < 0.02
     # Some of the points tell about the same.

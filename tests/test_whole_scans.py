@@ -27,19 +27,21 @@ TURN = Rotation.from_euler("z", 100, degrees=True).as_matrix()
 
 
 def about_z(degrees: float) -> Sim3:
+    """A turn about the vertical."""
     return Sim3(1.0, Rotation.from_euler("z", degrees, degrees=True).as_matrix(), np.zeros(3))
 
 
 def cloud(seed: int) -> np.ndarray:
     """Points of a long box with a tower near one end and a fin at its side."""
     rng = np.random.default_rng(seed)
+    # The middle and the half sides of each part.
     parts = [(0, 0, 0, 2, 0.7, 0.3), (1.3, 0, 0.7, 0.4, 0.4, 0.5), (-1, 0.8, 0, 0.5, 0.2, 0.2)]
     points = [rng.uniform(-1, 1, (400, 3)) * part[3:] + part[:3] for part in parts]
     return rng.permutation(np.concatenate(points))
 
 
 def shape(points: np.ndarray, up: np.ndarray | None = UP, span: float = 300.0) -> Shape:
-    """A shape in its own world, of points that are centred but for rounding."""
+    """A shape in its own world: points around their middle, seen over `span` degrees."""
     middle = points.mean(axis=0)
     return Shape(points - middle, Sim3(1.0, np.eye(3), -middle), up is not None, span)
 
@@ -68,7 +70,7 @@ def test_the_floor_and_the_ring_of_the_cameras_tell_the_vertical(crops):
     assert problem == ""
     assert vector_angle(up, of_images) < 5
     bare = [replace(crop, depth=np.where(crop.mask > 0.5, crop.depth, 0)) for crop in crops]
-    of_ring, _ = find_up(bare)
+    of_ring, _ = find_up(bare)  # without the floor, a little worse
     assert 0.1 < vector_angle(up, of_ring) < 8
     assert find_up(bare[:2]) == (None, "")
 
@@ -86,7 +88,7 @@ def test_a_shape_stands_upright_in_the_middle_of_its_object(crops):
     found = Shape.of(crops, up)
     assert_allclose(found.from_world.R @ up, UP, atol=1e-9)
     assert_allclose(np.sqrt(found.points.var(axis=0).mean()), 1, atol=1e-9)
-    assert found.span > 250
+    assert found.span > 250  # degrees; five frames all around leave gaps of about 72
     assert not Shape.of(crops, None).upright
     empty = replace(crops[0], depth=np.zeros_like(crops[0].depth))
     refused("no frame shows the object with depth", Shape.of, [empty], up)
@@ -146,6 +148,7 @@ def test_points_of_one_scan_are_found_on_the_other(tmp_path):
     found = estimate_pose(folder / "peugeot_308", folder / "peugeot_308")
     number = next(iter(found.frames))
     frame = found.frames[number]
+    # A pixel at least 12 pixels from the outline.
     inside = cv2.erode((frame.mask > 0.9).astype(np.uint8), np.ones((25, 25)))
     row, column = np.argwhere((inside > 0) & (frame.depth > 0))[0]
     pixel = {"frame": number, "x": column + 0.5, "y": row + 0.5}
@@ -162,7 +165,9 @@ def test_points_of_one_scan_are_found_on_the_other(tmp_path):
 def test_the_vertical_of_an_option_comes_before_what_the_scan_tells():
     method = ZeroShotPose(load_backbone(), solver="verified")
     path = sample_data() / "car" / "suv"
+    # The second one says that the vertical is not known.
     for up, expected in (((1, 0, 0), (1, 0, 0)), ((0, 0, 0), None)):
+        # One reference frame and three target views.
         found, problem = Scan.of(open_source(path, up=up), method, 1, 3).shape()
         assert (found.upright, problem) == (expected is not None, "")
         if expected:

@@ -25,6 +25,7 @@ from zsp_lite.course.widgets import common, cycles, outliers, patches  # noqa: E
 
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("closed_figures")]
 
+# A quarter turn about z.
 TURN = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
 
 
@@ -70,12 +71,15 @@ def test_without_ipywidgets_the_error_has_the_command_that_installs_it(monkeypat
 
 @pytest.fixture(scope="module")
 def sim():
+    """The similarities of a sample pair."""
     return similarity(*(view.features for view in examples.sample_views()))
 
 
 def test_the_caption_has_the_nearest_neighbour_and_the_share_of_correct_ones(sim):
     pair = examples.sample_pair()
-    kinds, cells = {"other": -sim, "one": sim}, np.stack(np.divmod(sim.argmax(1).numpy(), 28), -1)
+    kinds = {"other": -sim, "one": sim}
+    # The (row, column) of the nearest neighbour of each of 28 x 28 patches.
+    cells = np.stack(np.divmod(sim.argmax(1).numpy(), 28), -1)
     widget = patches.patch_similarities(
         pair.reference.rgb, pair.target.rgb, kinds, pair.cells, pair.valid, (15, 9)
     )
@@ -114,12 +118,13 @@ def test_the_cycle_has_the_cyclical_distance_and_names_the_background(sim):
 def test_the_caption_follows_the_settings_of_ransac():
     source = default_rng(0).normal(size=(40, 3))
     target = Sim3(1.3, TURN, np.ones(3)).apply(source)
-    target[:10] = 9
+    target[:10] = 9  # ten outliers
     images, pixels = np.zeros((2, 60, 60, 3)), np.zeros((2, 40, 2))
     widget = outliers.ransac_settings(tuple(images), tuple(pixels), (source, target), TURN)
     widget.controls["seed"].value = 3
     right = "30 of 40 matches are inliers; scale 1.30; rotation error 0°."
     assert widget.caption.value == right
+    # Matches on a line tell no rotation.
     line = np.outer(np.arange(40.0), [1, 2, 3])
     widget = outliers.ransac_settings(tuple(images), tuple(pixels), (line, line))
     assert widget.caption.value.startswith("No fit: ")

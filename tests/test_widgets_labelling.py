@@ -211,7 +211,7 @@ def test_a_click_selects_the_nearest_of_the_front_points():
 
 def test_outliers_do_not_change_the_scale_and_bad_clouds_are_input_errors():
     points = default_rng(3).uniform(size=(1000, 3))
-    points[0] = 1000
+    points[0] = 1000  # the outlier
     assert view_units(points).scale > 1
     for bad in (np.full((4, 3), np.nan), np.ones((4, 3))):
-        refused("not finite|no extent", view_units, bad)
+        refused("has no extent, expected finite points", view_units, bad)

@@ -8,9 +8,9 @@ from contextlib import redirect_stderr
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from captures import write_lists, write_nerfstudio
 from co3d_folders import sequence_data, write_identities
 from safetensors.torch import save_file
-from test_importers import write_lists, write_nerfstudio
 from uco3d_folders import write_uco3d
 
 from zsp_lite import Co3D, Frame, load_backbone
