@@ -155,7 +155,7 @@ def test_masks_and_depth_that_are_not_there_are_named_with_the_option_that_cures
     [
         ("nowhere", "nowhere does not exist, expected a picture .*, CATEGORY/SEQUENCE"),
         ("notes.txt", "notes.txt has another format, expected"),
-        ("ellipsoid", "has another format, expected .* CATEGORY/SEQUENCE"),
+        ("ellipsoid", "has another format .*, expected .* CATEGORY/SEQUENCE"),
         ("ellipsoid/c", "does not exist"),
         (".", r"nerfstudio, .*\(transforms\*.json\); .*lists \(poses.txt\)"),
     ],

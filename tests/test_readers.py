@@ -401,7 +401,7 @@ def test_an_import_names_a_damaged_image_unless_too_few_remain(tmp_path, views, 
     assert "3 frames" in text
     assert "flag: frames left out: 1: image" in text
     (images / "0001.jpg").write_bytes(b"")
-    assert "2 of 3 frames remain, expected 3: image" in run(f"{line} two", 2)
+    assert "2 of 4 frames remain, expected 3: image" in run(f"{line} two", 2)
 
 
 @pytest.mark.parametrize(

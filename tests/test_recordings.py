@@ -105,7 +105,7 @@ def test_the_longer_part_of_a_recording_that_breaks_is_used(tmp_path, views):
     source = open_recording(tmp_path)
     assert errors(source, views[20:27])[0] < 1
     assert re.search(
-        "frames left out: 5: the recording breaks: .*000000.jpg and 4 more do not join",
+        "frames left out: 5: the recording breaks: from .*000000.jpg on, 5 of 12 do not join",
         flags(source),
     )
 
@@ -120,7 +120,7 @@ def test_frames_that_are_dark_or_damaged_are_left_out(tmp_path, views):
     assert errors(source, [*views[:3], views[4]])[0] < 1
     left_out = " ".join(source.left_out)
     for reason in (
-        "000003.jpg and 0 more do not join",
+        "000003.jpg on, 1 of 6 do not join",
         "000005.jpg",
         "000006.jpg: no depth of its number",
     ):

@@ -205,8 +205,8 @@ def _track(makers: list[Callable[..., CaptureFrame]], name: str) -> Makers:
         if part is not longest:
             image = makers[min(part)].args[1]  # as `read_recording` gives it to `make_frame`
             problem = (
-                f"the recording breaks: {len(part)} frames from {image} on do not join the others "
-                "(fast motion, plain surfaces, wrong intrinsics, or depth of other times)"
+                f"the recording breaks: from {image} on, {len(part)} of {len(makers)} do not join "
+                "the others (fast motion, plain surfaces, wrong intrinsics, depth of another time)"
             )
             yield from [partial(refuse, problem)] * len(part)
 
