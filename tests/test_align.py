@@ -28,7 +28,7 @@ from zsp_lite.viz.category_sheet import objects_figure
 
 A, B, C = SEQUENCES
 HALF_TURN = Sim3(1.0, np.diag([-1.0, -1.0, 1.0]), np.zeros(3))
-PAIRS = 12  # six ordered pairs of objects, in each of which two frames of the first are asked
+PAIRS = 12  # lines of run.jsonl: six ordered pairs of objects, two frames of the first in each
 align_lumps = partial(align_category, Co3D(small_folder()), "lump", QUICK)
 
 
@@ -70,7 +70,7 @@ def test_objects_are_aligned_as_their_labels_and_the_written_labels_say(aligned_
 
 
 def test_the_row_of_the_benchmark_takes_the_pose_from_the_alignment_of_all_objects(tmp_path):
-    row = run_rows(["verified", "category"], tmp_path, 2, 3)["category"]
+    row = run_rows(["category"], tmp_path, pairs=2, targets=3)["category"]
     assert row["n"] == 2
     assert row["median"] < 20  # degrees
 

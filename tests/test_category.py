@@ -87,12 +87,17 @@ def test_contradictory_evidence_lowers_the_probability_and_names_the_other_turn(
     )
 
 
-# All others below twelve objects, and six from there on.
-@pytest.mark.parametrize("n, per_object", [(2, 1), (4, 3), (11, 10), (12, 6), (40, 6)])
-def test_pairs_connect_all_objects_and_every_object_has_the_same_number_of_partners(n, per_object):
+# By default all others below twelve objects, and six from there on.
+@pytest.mark.parametrize(
+    "n, given, per_object",
+    [(2, None, 1), (4, None, 3), (11, None, 10), (12, None, 6), (40, None, 6), (6, 4, 4)],
+)
+def test_pairs_connect_all_objects_and_every_object_has_the_same_number_of_partners(
+    n, given, per_object
+):
     names = [f"{k:02d}" for k in range(n)]
-    pairs = partners(names, per_object=None)
-    assert pairs == partners(names[::-1], per_object=None) == sorted(set(pairs))
+    pairs = partners(names, given)
+    assert pairs == partners(names[::-1], given) == sorted(set(pairs))
     ends = np.array(pairs, int)
     assert (ends[:, 0] < ends[:, 1]).all()
     assert_array_equal(np.bincount(ends.ravel()), np.full(n, per_object))

@@ -108,6 +108,7 @@ WRONG = [
     ("synth --category mouse --up +z --out x", "--up does not go with --category"),
     ("estimate a b --depth-unit 0", "got '0', expected a positive number"),
     ("estimate a b --box 1,2,3,4.5", "got '1,2,3,4.5', expected four integers"),
+    ("estimate a b --out x --out y", "--out is given twice, expected once"),
     ("estimate a b --up 0,1", "got '0,1', expected three numbers, or none"),
     ("estimate a b --intrinsics inf,1,2,3", "got 'inf,1,2,3', expected four numbers"),
     ("estimate --helpers c d a b", "Missing argument 'REFERENCE'"),

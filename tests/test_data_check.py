@@ -67,16 +67,20 @@ def test_a_broken_file_is_found_by_a_deep_check_alone(root):
 
 
 def test_black_and_empty_frames_are_counted_by_a_deep_check(root, run):
-    for part, count in (("images", 3), ("masks", 2)):
-        for path in sorted((root / "chair/a" / part).iterdir())[-count:]:
-            cv2.imwrite(str(path), np.zeros((24, 32), np.uint8))
+    images, masks = (sorted((root / "chair/a" / part).iterdir()) for part in ("images", "masks"))
+    for path in (*images[:2], masks[2]):
+        cv2.imwrite(str(path), np.zeros((24, 32), np.uint8))
     (shallow,) = check_folder(root)
     assert (shallow.defects, shallow.usable) == ({}, 2)
     (deep,) = check_folder(root, deep=True)
     # One of the four frames of a is left.
-    assert (deep.defects, deep.problems, deep.usable) == ({"black image": 3}, [], 1)
+    assert (deep.defects, deep.problems, deep.usable) == (
+        {"black image": 2, "empty object mask": 1},
+        [],
+        1,
+    )
     text = run(f"data check {root} --deep")
-    assert "chair: 3 of 8 frames cannot be used (black image 3)" in text
+    assert "chair: 3 of 8 frames cannot be used (black image 2, empty object mask 1)" in text
 
 
 def test_sequences_without_a_point_cloud_are_counted(root, run):

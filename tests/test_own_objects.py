@@ -30,7 +30,7 @@ from zsp_lite.data.co3d import Pair
 from zsp_lite.data.evaluation import spread
 from zsp_lite.data.labels import read_labels
 from zsp_lite.data.writing import write_image, write_mask
-from zsp_lite.errors import Contradiction
+from zsp_lite.errors import Contradiction, NoPoseError
 from zsp_lite.importers.convert import scale_frame
 from zsp_lite.importers.sources import Source, open_pair
 from zsp_lite.io.ply import read_ply
@@ -342,6 +342,25 @@ def test_several_frames_of_both_objects_agree_on_the_similarity_between_their_wo
     label = read_labels(ellipsoids.root, "ellipsoid")["b"].trans
     assert rotation_error(several.world_sim3.R, label[:3, :3]) < 5
     assert several.errors["verified"] < 5
+
+
+@slow
+def test_a_first_frame_that_determines_no_pose_leaves_the_answer_to_the_others(
+    several, ellipsoids, monkeypatch
+):
+    solve = ZeroShotPose.estimate_from_views
+    failures = iter([NoPoseError("few points")])
+
+    def first_fails(*arguments):
+        for failure in failures:
+            raise failure
+        return solve(*arguments)
+
+    monkeypatch.setattr(ZeroShotPose, "estimate_from_views", first_fails)
+    folder = ellipsoids.root / "ellipsoid"
+    found = estimate_pose(folder / "a", folder / "b", **SEVERAL)
+    assert len(found.votes) == len(several.votes) - 1
+    assert rotation_error(found.world_sim3.R, several.world_sim3.R) < 5  # degrees
 
 
 @slow

@@ -44,7 +44,7 @@ def test_a_stored_pair_is_small_accurate_and_has_the_similarities_of_the_origina
 
 @pytest.mark.slow
 def test_the_stored_places_of_chairs_are_those_that_the_library_finds(tmp_path):
-    """Others are of an earlier renderer, network or `transfer`: docs/rebuild.md writes new ones."""
+    """Places that differ are of another renderer or network: docs/rebuild.md writes new ones."""
     stored = stored_objects("chair")[:2]  # two of them, for speed
     export_categories(["chair"], tmp_path, 2, **RENDERED)
     poses = {

@@ -443,6 +443,15 @@ def test_lists_have_names_with_signs_cameras_for_each_image_and_several_sizes(tm
     assert wide.focal_length.tolist() == [300, 301]
 
 
+def test_frames_whose_names_are_times_are_numbered_by_their_order(tmp_path, views):
+    write_tum(tmp_path, views)
+    listed = tmp_path / "rgb.txt"
+    for number, seconds in enumerate(("1.9", "2.1")):
+        (tmp_path / f"images/{number:06d}.jpg").rename(tmp_path / f"images/{seconds}.jpg")
+        listed.write_text(listed.read_text().replace(f"{number:06d}", seconds))
+    assert open_source(tmp_path).numbers == tuple(range(len(views)))
+
+
 def test_the_camera_of_tum_is_by_default_that_of_its_sensors(tmp_path, views):
     write_tum(tmp_path, views)
     source = open_source(tmp_path)

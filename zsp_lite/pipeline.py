@@ -84,7 +84,7 @@ class ZeroShotPose:
             if not callable(chosen):  # else a plug-in
                 check_choice(name, chosen, allowed)
         check_integer("k", self.k, 1)
-        check_integer("trials", self.trials, 1, 1_000_000)  # all are in memory at once
+        check_integer("trials", self.trials, 1, 1_000_000)  # the poses of all are in memory
         check_integer("sample_size", self.sample_size, 3)
         check_integer("seed", self.seed, 0)
         if not callable(self.backbone):

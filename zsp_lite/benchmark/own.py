@@ -200,7 +200,9 @@ class StoredPoses:
     """Row of poses that another program computed (see `exchange`)."""
 
     path: str
-    _poses: Mapping[str, StoredPose]  # by the key of the pair; private: not in descriptions
+    _poses: Mapping[
+        str, StoredPose
+    ]  # by the key of the pair; private, so that `described` leaves it out
     digest: str  # of the file
 
     def __call__(self, problem: PairProblem) -> Answer:

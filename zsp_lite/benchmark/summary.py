@@ -112,8 +112,9 @@ _FIGURES: dict[str, Callable[..., Any]] = {
 
 
 def paired_difference(first: ArrayLike, second: ArrayLike, weights: Draws | None = None) -> dict:
-    """Measure by how much the second method is more accurate than the first on the same pairs, of
-    which those with errors (n,) below 30 degrees are solved.
+    """Measure by how much the second method is more accurate than the first on the same pairs.
+
+    Errors (n,) are in degrees; a pair is solved below 30.
 
     "accuracy_gain" is second - first in percentage points, with its 95 % interval and its p value
     by the bootstrap.

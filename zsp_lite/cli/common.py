@@ -28,7 +28,7 @@ class Parsed(click.ParamType):
     valid: Callable[[Any], bool] = bool
 
     def convert(self, value, parameter, context):
-        with suppress(ValueError, OverflowError):
+        with suppress(ValueError):
             parsed = self.parse(value)
             if self.valid(parsed):
                 return parsed
@@ -59,7 +59,7 @@ INTRINSICS = Parsed(
 )
 UP = Parsed(
     "x,y,z",
-    # Zeros are for `open_source` that no vertical is to be used.
+    # `open_source` takes zeros to mean that no vertical is used.
     parse=lambda text: (0.0,) * 3 if text == "none" else tuple(map(float, text.split(","))),
     valid=lambda values: len(values) == 3 and all(map(math.isfinite, values)),
     expected="three numbers, or none",

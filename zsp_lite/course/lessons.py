@@ -9,7 +9,7 @@ from zsp_lite.course.widgets.common import show as show  # lessons import it fro
 from zsp_lite.data.co3d import Co3D
 
 
-def open_lesson() -> tuple[Co3D, Backbone]:
+def open_lesson(device: str = "cpu") -> tuple[Co3D, Backbone]:
     """Return the data and the backbone of a lesson: the samples and zsp-tiny, or those that the
     environment names.
 
@@ -20,4 +20,4 @@ def open_lesson() -> tuple[Co3D, Backbone]:
 
     set_matplotlib_formats("jpeg", pil_kwargs={"quality": 85})
     dataset = Co3D(os.environ.get("ZSP_LITE_DATA") or sample_data())
-    return dataset, load_backbone(os.environ.get("ZSP_LITE_BACKBONE") or "zsp-tiny", "cpu")
+    return dataset, load_backbone(os.environ.get("ZSP_LITE_BACKBONE") or "zsp-tiny", device)

@@ -182,7 +182,7 @@ def other_convention(dataset: Co3D, poses: Mapping[Pair, StoredPose]) -> str:
     # The errors of a wrong reading may be small by chance, as for rotations by small angles: a sign
     # test decides whether more pairs agree with the other reading than chance explains.
     by_chance = binom.sf((errors[best] < errors[""]).sum() - 1, len(truths), 1 / 2)
-    # The other reading is named if its median is at most half as large, and 30 degrees (Acc30).
+    # The other reading is named if its median is at most half as large, and at most 30 degrees.
     if medians[best] > min(30, medians[""] / 2) or by_chance > _CHANCE:
         return ""
     return (

@@ -195,7 +195,10 @@ def _write_sequence(
     base = f"{category}/{plain_name(sequence.name, 'sequence')}"
     annotations = []
     for number, frame, timestamp in zip(
-        sequence.numbers or range(len(sequence.frames)), sequence.frames, sequence.timestamps
+        sequence.numbers or range(len(sequence.frames)),
+        sequence.frames,
+        sequence.timestamps,
+        strict=True,
     ):
         stem = f"frame{number + 1:06d}"  # CO3D numbers frames from 0, and their files from 1
         image = ImageAnnotation(f"{base}/images/{stem}.jpg", frame.camera.size)

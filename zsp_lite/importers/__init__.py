@@ -43,7 +43,15 @@ class Format:
 
 PACKED = (".zip", ".r3d")  # extensions of files that apps export
 
-_COLMAP = ("sparse", "images.bin", "images.txt", "cameras.*", "points3[Dd].*", "database.db")
+_COLMAP = (
+    "sparse",
+    "images.bin",
+    "images.txt",
+    "cameras.bin",
+    "cameras.txt",
+    "points3[Dd].*",
+    "database.db",
+)
 _ARKIT_UP = (0.0, 1.0, 0.0)  # gravity points along -y
 # The format of a folder is the first one whose signs it has.
 FORMATS = {
@@ -183,7 +191,7 @@ def recognise(given: Any) -> tuple[str, Any]:
             if fnmatch(name, sign) and name.count("/") == sign.count("/"):
                 raise InputError(f"{path} {problem}, {way_out}")
     problem = "has another format" if path.exists() else "does not exist"
-    if files:
+    if len(files) > 1:
         problem += f" ({', '.join(sorted(file.name for file in files)[:4])}, ...)"
     known = "; ".join(f"{layout.what} ({', '.join(layout.signs)})" for layout in FORMATS.values())
     known = known.replace(RECORDED, "rgb or color")
@@ -226,10 +234,11 @@ def open_capture(
             left_out.append(str(error))
     frames.sort(key=lambda frame: natural_order(frame.image))
 
-    # The number of a frame is the last one in its image's path, or 0; of a long number, the last 15
-    # digits, which a float holds, too. If these are not all different, it is the position.
-    numbers = dict.fromkeys([0, *natural_order(frame.image)][-2] % 10**15 for frame in frames)
-    if len(numbers) < len(frames):
+    # The number of a frame is the last one in its image's name, or 0; of a long number, the last 15
+    # digits, which a float holds, too. If they do not rise with the order, it is the position.
+    names = [Path(frame.image.name) for frame in frames]
+    numbers = [[0, *natural_order(name)][-2] % 10**15 for name in names]
+    if numbers != sorted(set(numbers)):
         numbers = range(len(frames))
 
     # A frame's own mask comes before the one in the capture's folder masks/. If the folder `masks`
@@ -255,5 +264,5 @@ def open_capture(
         problem = "no frame, expected some"
         if left_out:
             problem = f"none of {len(left_out)} frames can be used: {left_out[0]}"
-        raise InputError(f"capture {folder.name}: {problem}")
+        raise InputError(f"capture {folder.resolve().name}: {problem}")
     return Capture(frames, left_out)

@@ -161,8 +161,7 @@ def disagreement(frames: Iterable[Frame], unit: float | None = None) -> str:
 
     # Mistakes in poses and units.
     closeness = _share(pairs, weighted=True)
-    # The closeness is 1 at most: no factor can raise it enough, and the share, which is no less, is
-    # above `_AGREEING`.
+    # The closeness is 1 at most, so no factor can raise it enough. The share is no less than it.
     if _SCALE_GAIN * closeness > 1:
         return ""
     factors = _SMALL_SCALES

@@ -144,8 +144,8 @@ def read_record3d(folder: Path) -> Makers:
     unpacked = new_folder()
     if not any(map(any, scan.poses)):
         raise InputError(
-            f"{folder.name}/metadata: all {len(scan.poses)} poses are zero: the tracking failed, "
-            "expected another scan"
+            f"{folder.resolve().name}/metadata: all {len(scan.poses)} poses are zero: the tracking "
+            "failed, expected another scan"
         )
     # fx, fy, cx, cy of each frame. A file without them has one K for all frames.
     every = scan.perFrameIntrinsicCoeffs or [[scan.K[k] for k in (0, 4, 6, 7)]] * len(scan.poses)

@@ -151,7 +151,8 @@ class Source:
         flags = []
         if self.left_out:
             reasons = list(dict.fromkeys(self.left_out))
-            flags.append(f"frames left out: {len(self.left_out)}: {'; '.join(reasons[:3])}")
+            more = f"; and {len(reasons) - 3} more" if len(reasons) > 3 else ""
+            flags.append(f"frames left out: {len(self.left_out)}: {'; '.join(reasons[:3])}{more}")
         flags += depth_flags(frames, metric=self.format != "sequence")
         flags += map(Doubt, self.doubts)
         if self.mask == "given":

@@ -1,4 +1,4 @@
-"""One's own pair, from files or frames to files: open, load (see `scans`), estimate, write.
+"""One's own pair, from files or frames to files: open, load (see `scan`), estimate, write.
 
 A source is a sequence of a data folder, a folder with a capture, an image with depth, or frames in
 memory.
@@ -91,8 +91,8 @@ def estimate_pose(
             since phones may store images turned, and keeps the best. The pose is then that of the
             turned image, and a flag says so.
         references: Largest number of frames of each object that are solved against views of the
-            other, of which the first two mostly do; 1 is the paper's setting. By default 4, or 1
-            with a `reference_frame`.
+            other: two first, more only if these leave doubt; 1 is the paper's setting. By default
+            4, at most `targets`; 1 with a `reference_frame` and no helpers.
         helpers: Other objects of the category: what two objects cannot tell, all together mostly
             can.
         workers: Number of frames that are solved at once, by threads.
@@ -122,7 +122,7 @@ def estimate_pose(
         sources = open_pair(reference, target, options, helpers)
         model = as_backbone(backbone)
         foreground = "saliency" if getattr(model, "has_saliency", True) else "mask"
-        # Turns, and frames that vote, take the last solver, of both the verified one.
+        # The last solver finds turns and votes: of "both" it is the verified one.
         method = ZeroShotPose(model, foreground=foreground, solver=solvers[-1])
 
         # The frames of all objects. Only where frames vote, the reference also has target views,
@@ -221,12 +221,13 @@ def _by_all(
         targets = of_name[question.target].target_views
         try:
             matched = method.match_views(view, targets)
+            # Also where the views determine no pose: the answer shows those of its frame.
+            matches[question] = [one.matches for one in matched]
             found = method.estimate_from_views(view, targets, matched)
         except NoPoseError as error:
             problems.append(error)
             return None
         estimates[question] = found
-        matches[question] = [one.matches for one in matched]
         return world_hypotheses(question.reference, question.target, found)
 
     def ask(questions: list[Question]) -> list[PairHypotheses | None]:
@@ -321,7 +322,7 @@ def _answer(
         angles = rotation_angle(np.stack([pose.R for pose in poses]), np.eye(3)) + penalty
         nearest = int(angles.argmin())
         score = float(np.log(max(probability, 1e-9)))  # finite for a probability of 0
-        # It combines several scores, so it has no terms of one.
+        # The score has no terms: these are of a solver's score.
         hypotheses.append(Hypothesis(poses[nearest], nearest, score, {}, probability, mode))
         view_angles.append(angles)
 

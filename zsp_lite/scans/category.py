@@ -2,8 +2,8 @@ r"""All objects of a category in one common frame, without labels: synchronisati
 of many pairs.
 
 Here a pair is a pair of objects (a, b) with a few hypotheses: similarities from the world of a to
-that of b, with probabilities, of a frame of a that the verified solver found in views of b, or of
-all that was seen of both (see `judge`). Two objects may have several.
+that of b, with probabilities. They are what the verified solver found for one frame of a in views
+of b, or what all frames of both tell together (see `judge`). Two objects may have several pairs.
 
 One pair often cannot tell the front from the back; all pairs mostly can (Birdal et al.,
 Synchronizing probability measures on rotations, CVPR 2020). Sought is a similarity x -> s_i Q_i x +
@@ -125,7 +125,8 @@ def partners(names: Sequence[str], per_object: int | None) -> list[tuple[str, st
     # and after it.
     rng = np.random.default_rng(0)
     circle = [sorted(names)[k] for k in rng.permutation(n)]
-    steps = [1, *(2 + rng.permutation(n // 2 - 1)).tolist()]  # the first connects all objects
+    # The first connects all objects. Half of the circle would be one partner, not two.
+    steps = [1, *(2 + rng.permutation((n - 1) // 2 - 1)).tolist()]
     steps = steps[: (per_object + 1) // 2]
     pairs = {tuple(sorted((circle[k], circle[(k + step) % n]))) for k in range(n) for step in steps}
     return sorted(pairs)
@@ -289,9 +290,10 @@ def _judge(votes: _Votes, poses: _Poses, to_centre: Sim3) -> AlignedObject:
     margin = (scores[0] - others.max()) / np.sqrt(len(surest))
     none = _NONE + _NONE_AGREEING * (1 - different[1:][surest].mean())
     probability, other, _ = softmax([0.0, -_MARGIN * margin, none]).tolist()
-    # The probabilities of a single pair say more; it may have one hypothesis only.
+    # The probabilities of a single pair say more.
     if len(surest) == 1:
-        probability, other, *_ = (*votes.probability.tolist(), 0.0)
+        probability = float(votes.probability[0])
+        other = float(votes.probability[others[1:].argmax()]) if different.any() else 0.0
 
     # The alternative is turned about the object's centre.
     pose = Sim3.from_matrix(options[0])

@@ -28,8 +28,8 @@ _INLIER_DISTANCE = 0.3  # working units
 _MIN_ANGLE = 20.0  # degrees between the proposals of a view
 # So many best samples of a view go into non-maximum suppression, which compares all pairs.
 _POOL = 200
-# Turns of the first view's viewpoint about the vertical: once around in steps of 30 degrees. By 0
-# it is a proposal already.
+# Turns of the first view's viewpoint about the vertical: once around in steps of 30 degrees. The
+# turn by 0 is a proposal already.
 _TURNS = torch.deg2rad(torch.arange(30.0, 360.0, 30.0))
 # Scale of the proposals that are viewpoints: the points that one view shows have about this
 # fraction of the whole object's spread.

@@ -239,11 +239,11 @@ class _LabellingWidget:
                 try:
                     text = step() or text
                 except InputError as error:
-                    problem = str(error)
+                    problem = f"Not done: {error}" if step is action else str(error)
         finally:
             self.refreshing = False
         kind = "problem" if problem else "info"
-        shown = f"Not done: {problem}" if problem else text or self._instruction()
+        shown = problem or text or self._instruction()
         # With this role, screen readers announce the message.
         self.message.value = (
             f'<p class="{kind}" role="status" aria-live="polite">{html.escape(shown)}</p>'

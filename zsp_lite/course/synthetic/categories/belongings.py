@@ -235,7 +235,7 @@ def mouse(draw: Draw) -> Parts:
     height = draw(0.32, 0.55)
     shell = rounded_box((length, width, 2 * height), squareness=draw(2.2, 3.5))
     # Only the upper half of the shell remains, lower at the front and higher at the back. The
-    # height is as before at x = -0.1 length.
+    # height is unchanged at x = -0.1 length.
     vertices = shell.vertices.copy()
     slope = 1 - draw(0.1, 0.4) * (vertices[:, 0] / length + 0.1)
     vertices[:, 2] = np.maximum(vertices[:, 2], 0) * slope
