@@ -110,7 +110,7 @@ BAD_FILES = [
     (
         INDEX,
         read_frame_index,
-        "cannot be decompressed",
+        "no gzip data that can be read",
         {"cut": gzip.compress(bytes(99))[:-6], "bytes behind": gzip.compress(b"[]") + b"x"},
     ),
     (

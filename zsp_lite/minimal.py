@@ -88,9 +88,7 @@ def kmeans(vectors, k, seed=0):
     """Assign n vectors to k clusters: labels (n,)."""
     from sklearn.cluster import KMeans  # takes half a second
 
-    values, axes = np.linalg.eigh(
-        (vectors @ vectors.T).round(decimals=6)
-    )  # equal distances stay equal
+    values, axes = np.linalg.eigh((vectors @ vectors.T).round(decimals=6))  # ties stay ties
     points = axes * np.sqrt(np.maximum(values, 0))  # with these distances
     draw = int(np.random.default_rng(seed).integers(2**31))
     return KMeans(k, n_init=1, random_state=draw).fit_predict(points)
@@ -133,9 +131,7 @@ def pixel_depths(crop, patches):
     It is at the 25th percentile of the known depths, or the centre, in-painted, if none is known.
     """
     known = crop.depth > 0
-    filled = cv2.inpaint(
-        crop.depth, np.uint8(~known), 3, cv2.INPAINT_NS
-    )  # may leave the known range
+    filled = cv2.inpaint(crop.depth, np.uint8(~known), 3, cv2.INPAINT_NS)  # may overshoot
     filled = np.clip(np.nan_to_num(filled), crop.depth[known].min(), crop.depth.max())
     height, width = np.array(crop.depth.shape) // crop.saliency.shape  # of a patch, in pixels
     found = np.empty((len(patches), 3))

@@ -132,7 +132,7 @@ def decompress(data: bytes, what: str) -> bytes:
         problem = f"{len(data)} bytes grow to more than {limit}"
     except (OSError, EOFError, zlib.error) as error:
         problem = str(error)
-    raise InputError(f"{what}: cannot be decompressed: {problem}")
+    raise InputError(f"{what}: no gzip data that can be read: {problem}")
 
 
 def path_inside(root: str | Path, relative: str) -> Path:
