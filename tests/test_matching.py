@@ -1,7 +1,6 @@
 """Similarity against materialised descriptors, cyclical distances against loops, what `match`
 promises, and the other matchers against their definitions, worked out another way."""
 
-import cv2
 import numpy as np
 import ot
 import pytest
@@ -11,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.random import default_rng
 from numpy.testing import assert_allclose, assert_array_equal
+from scipy.ndimage import gaussian_filter1d
 from sklearn.cluster import KMeans
-from threadpoolctl import threadpool_info
 from torch.testing import assert_close
 
 from zsp_lite import matching
@@ -162,18 +161,16 @@ def test_cycles_from_the_target_are_the_published_cycles_of_the_swapped_pair():
     assert_array_equal(matches.reference @ (9, 1), forth[matches.target @ (10, 1)])
 
 
-def test_clusters_are_computed_by_one_thread(monkeypatch):
-    class Observed(KMeans):
-        def fit(self, points):
-            threads.update(
-                [cv2.getNumThreads(), *(one["num_threads"] for one in threadpool_info())]
-            )
-            return super().fit(points)
-
-    threads = set()
-    monkeypatch.setattr("sklearn.cluster.KMeans", Observed)
-    matching._cluster(np.eye(8), k=4, seed=0)
-    assert threads == {1}
+@pytest.mark.parametrize("seed", range(20))
+def test_clusters_are_those_of_scikit_learn(seed):
+    # Patches whose descriptors overlap, on the unit sphere.
+    points = gaussian_filter1d(np.random.default_rng(seed).normal(size=(100, 60)), 3, axis=0)
+    points /= np.linalg.norm(points, axis=1, keepdims=True)
+    gram = (points @ points.T).round(decimals=6)
+    values, vectors = np.linalg.eigh(gram)
+    draw = int(np.random.default_rng(seed).integers(2**31))
+    expected = KMeans(50, n_init=1, random_state=draw).fit(vectors * values.clip(0) ** 0.5).labels_
+    assert_array_equal(matching._cluster(gram, 50, seed), expected)
 
 
 # Similarities of the 12 patches of one image and the 15 of another, and which patches are on the

@@ -134,25 +134,3 @@ def paired_difference(first: ArrayLike, second: ArrayLike, weights: Draws | None
         "accuracy_gain_ci": interval_of(replicates),
         "accuracy_gain_p": min(1.0, float(p)),
     }
-
-
-def paired_test(first: ArrayLike, second: ArrayLike) -> dict:
-    """Test whether the second method is better than the first on the same pairs. All p values are
-    two-sided.
-
-    Errors (n,) are in degrees; a pair is solved below 30. To what `paired_difference` returns is
-    added "sign_test_p", of McNemar's exact test. It treats pairs as independent: where pairs share
-    objects, this p value is too small.
-    """
-    from scipy.stats import binomtest  # takes a second, and no command needs it
-
-    first = np.asarray(first, np.float64)
-    second = np.asarray(second, np.float64)
-    # McNemar's test is the sign test of the pairs that one method alone solves.
-    solved = first < 30
-    solved_by_second = second < 30
-    alone = np.count_nonzero(solved != solved_by_second)
-    sign = 1.0
-    if alone:
-        sign = binomtest(np.count_nonzero(solved_by_second & ~solved), alone).pvalue
-    return paired_difference(first, second) | {"sign_test_p": float(sign)}
