@@ -30,11 +30,10 @@ def spanning_tree(answers: Sequence[PairHypotheses]) -> dict[str, Float[np.ndarr
     while len(placed) < len(names):
         leading = [one for one in answers if (one.reference in placed) != (one.target in placed)]
         surest = max(leading, key=lambda one: one.probabilities[0])
-        turn = surest.sim3s[0].R
-        if surest.reference in placed:
-            placed[surest.target] = placed[surest.reference] @ turn.T
-        else:
-            placed[surest.reference] = placed[surest.target] @ turn
+        first, second, turn = surest.target, surest.reference, surest.sim3s[0].R
+        if second in placed:
+            first, second, turn = second, first, turn.T
+        placed[second] = placed[first] @ turn
     return {name: placed[name] for name in names}
 
 
