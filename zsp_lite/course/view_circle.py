@@ -43,7 +43,7 @@ def show_view_circle(
     circle.set_thetagrids(range(0, 360, 90), ["turn 0°", "+90°", "180°", "−90°"])
     # The rings have their labels at the view whose score is farthest from all of them.
     away = np.abs(scores[:, None] - _RINGS).min(axis=1)
-    circle.set_rgrids(_RINGS, ["−45", "−35", "score −25"], turns[away.argmax()], fontsize=8)
+    circle.set_rgrids(_RINGS, ["score −45", "−35", "−25"], turns[away.argmax()], fontsize=8)
 
     order = np.argsort(turns)
     closed = np.append(order, order[0])
