@@ -318,7 +318,8 @@ def _outcome(
         return trace if frame.f_code.co_filename == f"<{name}>" else None
 
     before = sys.gettrace()
-    sys.settrace(trace)
+    if end < math.inf:
+        sys.settrace(trace)
     flat = []
     try:
         result = function(**arguments)
