@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from jaxtyping import config
 from numpy.testing import assert_allclose, assert_array_equal
 from one_page import SCREENS, build_page, open_page, screen, tab_to
 from playwright.sync_api import Browser, Page
@@ -60,7 +61,10 @@ PACK = """(array) => {
 def playground(tmp_path_factory) -> Path:
     """Folder of a site with this one page."""
     folder = build_page("docs/playground", tmp_path_factory.mktemp("site"))
+    # While the network is traced, its sizes are tensors, not the integers of the annotations.
+    config.update("jaxtyping_disable", True)
     write_page_data(folder / "docs/playground")
+    config.update("jaxtyping_disable", False)
     return folder
 
 
