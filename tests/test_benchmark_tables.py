@@ -97,7 +97,7 @@ def test_published_figures_stand_apart(every):
     assert cell(every["table_1"], "SWaV", "Acc30 (%)") is None  # was published only
 
 
-def test_a_difference_to_ours_is_that_of_the_paired_test(three):
+def test_a_difference_to_ours_is_the_paired_difference(three):
     ours = three.row("ours")
     test = paired_difference(ours["error"], three.row("rootsift")["error"], weights=draws_of(ours))
     assert three.summary["against"]["rootsift"] == test
