@@ -62,15 +62,18 @@ format: $(STAMP)
 	$(RUN) -m ruff format .
 	$(RUN) -m ruff check --fix .
 
-# On a copy, so that the tracked notebooks stay as they are, without the outputs that answer a prediction. The root is this folder, as the notebooks link to docs/.
-# Open3D brings dash along, whose JupyterLab extension would ask for a build that nothing here needs; without an address
-# for news, JupyterLab does not ask whether to fetch them.
+# On a copy, so that the tracked notebooks stay as they are, without the outputs that answer a prediction and the
+# solutions of the exercises. The root is this folder, as the notebooks link to docs/.
+# Open3D brings dash along, whose JupyterLab extension would ask for a build that nothing here needs. Without its
+# announcements, JupyterLab does not ask whether to fetch news.
 lab: $(STAMP)
 	@[ -d $(LAB) ] || { rm -rf $(LAB).new && cp -R notebooks $(LAB).new && $(RUN) -m tools.lab $(LAB).new && \
-	  mv $(LAB).new $(LAB) && echo "Made $(LAB)/, a copy of notebooks/ that is yours"; }
+	  rm -rf $(LAB).new/exercises/source $(LAB).new/exercises/*.db && mv $(LAB).new $(LAB) && \
+	  echo "Made $(LAB)/, a copy of notebooks/ that is yours"; }
 	@echo "Changes are saved in $(LAB)/. For a fresh copy, move that folder away and run make lab again."
 	@[ "$$(id -u)" != 0 ] || echo "You are root, as in most containers. JupyterLab refuses to run as root without --allow-root, so it is given."
-	$(RUN) -m jupyter lab $$([ "$$(id -u)" != 0 ] || echo --allow-root) --LabApp.news_url=None \
+	@$(RUN) -m jupyter labextension disable @jupyterlab/apputils-extension:announcements
+	$(RUN) -m jupyter lab $$([ "$$(id -u)" != 0 ] || echo --allow-root) \
 	  --ServerApp.tornado_settings="{'page_config_data': {'buildCheck': False}}" \
 	  --ServerApp.root_dir=. --LabApp.default_url=/lab/tree/$(LAB)
 

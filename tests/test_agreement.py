@@ -61,6 +61,13 @@ def scaled(factor: float, frame: Frame) -> Frame:
     return replace(frame, depth=frame.depth * np.float32(factor))
 
 
+def longer(frame: Frame) -> Frame:
+    """The camera if its focal length is 25 % too long."""
+    return replace(
+        frame, camera=replace(frame.camera, focal_length=1.25 * frame.camera.focal_length)
+    )
+
+
 def along_ray(frame: Frame) -> Frame:
     """The depth if it is measured along the ray of each pixel, not along the axis of the camera."""
     height, width = frame.camera.size
@@ -81,8 +88,7 @@ def farther(frame: Frame) -> Frame:
     [
         (inverted, r"agree \(\d+%\) if the poses are world to camera$"),
         (flipped, "if the poses have the other axes, OpenGL's for OpenCV's or the reverse"),
-        # OpenGL's axes are named if they are the only mistake.
-        (lambda frame: inverted(flipped(frame)), "if the poses are world to camera$"),
+        (lambda frame: inverted(flipped(frame)), "are world to camera, and have the other axes"),
         (reordered, "if the poses are from quaternions with w first"),
         (partial(scaled, 0.001), r"if the depth is taken in metres: --depth-unit 1$"),
         (partial(scaled, 5), "if the depth is taken in 1/5000 m: --depth-unit 0.0002$"),
@@ -91,6 +97,7 @@ def farther(frame: Frame) -> Frame:
         (partial(scaled, 0.26), r"by 3.8\d?: --depth-unit 0.0038"),  # no usual unit is near
         (partial(scaled, 1.15), r"by 0.8[678]\d?: --depth-unit 0.0008[678]"),
         (partial(scaled, 0.85), r"by 1.1[78]: --depth-unit 0.0011[78]"),
+        (longer, r"if the focal length is multiplied by 0.(79|83)$"),
         (
             lambda frame: scaled(1 + 0.2 * int(frame.name), frame),
             "by a factor of its own",

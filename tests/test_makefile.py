@@ -30,7 +30,7 @@ def folder(tmp_path):
     user is."""
     for name in ("Makefile", "environment.txt", "pyproject.toml"):
         shutil.copy(REPOSITORY / name, tmp_path)
-    (tmp_path / "notebooks").mkdir()
+    (tmp_path / "notebooks/exercises/source").mkdir(parents=True)
     (tmp_path / "notebooks/00.ipynb").write_text("original")
     for name, content in (("python", PYTHON), ("id", "#!/bin/sh\necho $USER_ID\n")):
         path = tmp_path / "bin" / name
@@ -74,11 +74,12 @@ def test_lab_opens_a_copy_of_the_notebooks_and_says_why_it_allows_root(folder, u
     assert ("--allow-root" in calls[-1]) == ("You are root" in text) == is_root
     # The root is the repository, so that links of the notebooks to docs/ lead somewhere.
     options = {
-        "--LabApp.news_url=None",
         "--ServerApp.root_dir=.",
         "--LabApp.default_url=/lab/tree/my_notebooks",
     }
     assert options <= set(calls[-1].split())
+    assert "labextension disable @jupyterlab/apputils-extension:announcements" in calls[-2]
+    assert not (folder / "my_notebooks/exercises/source").exists()
     (folder / "my_notebooks/00.ipynb").write_text("changed")
     text, _ = make(folder, "lab", USER_ID=user)
     assert (folder / "notebooks/00.ipynb").read_text() == "original"

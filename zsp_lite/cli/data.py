@@ -257,7 +257,7 @@ class _Import(Once):
     "import",
     cls=_Import,
     epilog=examples(
-        "data import scan.zip --root mine --category cup --sequence one",
+        "data import scan.zip --root mine --category cup --sequence one --mask auto",
         "data import uco3d --help",
     ),
 )
@@ -347,7 +347,7 @@ def _print_import(folder: Path, imported: Any) -> None:
     """Print the numbers of an `ImportResult`."""
     print(
         f"Written: {folder}: {imported.frames} frames, {imported.points:,} points, "
-        f"scaled by {imported.scale:.4g}"
+        f"scaled by {imported.scale:.4g}{imported.size}"
     )
     for flag in imported.flags:
         print(f"flag: {flag}")

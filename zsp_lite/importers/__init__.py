@@ -18,6 +18,7 @@ from zsp_lite.importers.capture import (
     find_masks,
     natural_order,
     sharpest,
+    some,
 )
 from zsp_lite.importers.files import PICTURES
 from zsp_lite.importers.lists import read_lists, read_tum
@@ -88,8 +89,9 @@ _LISTS = "expected its files as the format lists: rgb.txt, depth.txt, poses.txt,
 _OTHERS = (
     (
         ("cameras/*.json", "corrected_cameras/*.json"),
-        "is the inner folder of Polycam's raw data",
-        "expected all of it in a folder keyframes/",
+        "has cameras/*.json, as the inner folder of Polycam's raw data",
+        "expected all of Polycam's in a folder keyframes/, or of others the files of the format "
+        "lists: rgb.txt, depth.txt, poses.txt, intrinsics.txt",
     ),
     (("frame_[0-9]*.json",), "is a scan of 3d Scanner App", _LISTS),
     (("lowres_wide.traj", "lowres_depth"), "is a scene of ARKitScenes", _LISTS),
@@ -263,6 +265,6 @@ def open_capture(
     if not frames:
         problem = "no frame, expected some"
         if left_out:
-            problem = f"none of {len(left_out)} frames can be used: {left_out[0]}"
+            problem = f"none of {len(left_out)} frames can be used: {some(left_out)}"
         raise InputError(f"capture {folder.resolve().name}: {problem}")
     return Capture(frames, left_out)

@@ -3,7 +3,7 @@
 import os
 import re
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path, PureWindowsPath
@@ -173,6 +173,13 @@ def make_frame(
         confidence=paths[3],
         **others,
     )
+
+
+def some(problems: Iterable[str]) -> str:
+    """List three different problems, and count the others."""
+    different = list(dict.fromkeys(problems))
+    more = f"; and {len(different) - 3} more" if len(different) > 3 else ""
+    return f"{'; '.join(different[:3])}{more}"
 
 
 def refuse(problem: str) -> NoReturn:

@@ -268,7 +268,7 @@ def depth_flags(frames: Iterable[Frame], metric: bool) -> Iterator[str]:
         yield (
             f"the object is {distance:.3g} m from the camera, expected {PLAUSIBLE[0]:g} to "
             f"{PLAUSIBLE[1]:g} m; the unit of its depth is given by --depth-unit or depth_unit "
-            "(0.001: millimetres, 1: metres)"
+            "(0.001: millimetres, 1: metres); disparity is no depth"
         )
     if known < _LEAST_KNOWN * seen:
         yield Doubt(f"depth is known on {known / seen:.0%} of the object only")

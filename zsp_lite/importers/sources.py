@@ -17,7 +17,7 @@ from zsp_lite.data.frames import ON_OBJECT, Frame, frame_defect, list_frames
 from zsp_lite.errors import Doubt, InputError, check_choice
 from zsp_lite.importers import FORMATS, open_capture, recognise
 from zsp_lite.importers.agreement import disagreement, neighbours
-from zsp_lite.importers.capture import CaptureFrame
+from zsp_lite.importers.capture import CaptureFrame, some
 from zsp_lite.importers.files import (
     CO3D_DEPTH,
     DEPTHS,
@@ -34,6 +34,7 @@ from zsp_lite.importers.masks import (
     masks_from_depth,
 )
 from zsp_lite.importers.registration import misregistration
+from zsp_lite.points import near_median, object_points
 
 # The options that each format takes. "open" stands for a source that is open already.
 _MASKED = ("mask", "box", "up")
@@ -83,12 +84,30 @@ class Source:
         # An inner folder of Polycam's has the same name in all scans.
         return path.parent.name if path.name == "keyframes" else path.name
 
-    def describe(self, positions: Sequence[int]) -> str:
-        """Name the source and its frames at some positions."""
+    def describe(self, positions: Sequence[int], frames: Mapping[int, Frame]) -> str:
+        """Name the source and its frames at some positions, and the object's `size` in them."""
+        size = self.size(frames[position] for position in positions)
         if self.format == "image":
-            return f"image {self.path}"
-        frames = ", ".join(str(self.numbers[position]) for position in positions)
-        return f"{self.format} {self.path}, frame{'s' if len(positions) > 1 else ''} {frames}"
+            return f"image {self.path}{size}"
+        shown = ", ".join(str(self.numbers[position]) for position in positions)
+        return f"{self.format} {self.path}, frame{'s' if len(positions) > 1 else ''} {shown}{size}"
+
+    def size(self, frames: Iterable[Frame]) -> str:
+        """Say how wide and how far away the object is in the first of the frames that shows it.
+
+        Nothing but a ruler can check the unit and the intrinsics of a single image.
+        """
+        unit = "" if self.format == "sequence" else " m"  # sequences have their own unit
+        for frame in frames:
+            points = object_points(frame)
+            if len(points):
+                # Single points may be off the object.
+                low, middle, high = np.percentile(points[near_median(points)], [1, 50, 99], axis=0)
+                return (
+                    f"; by depth and intrinsics, the object in {frame.name or 'the first frame'} "
+                    f"is {(high - low)[0]:.3g}{unit} wide and {middle[2]:.3g}{unit} away"
+                )
+        return ""
 
     def load(self, positions: Sequence[int], context: int = _CONTEXT) -> list[Frame]:
         """Load frames with masks of the object.
@@ -150,9 +169,7 @@ class Source:
         """List doubts about the masks and depth of frames, and the intrinsics and poses of all."""
         flags = []
         if self.left_out:
-            reasons = list(dict.fromkeys(self.left_out))
-            more = f"; and {len(reasons) - 3} more" if len(reasons) > 3 else ""
-            flags.append(f"frames left out: {len(self.left_out)}: {'; '.join(reasons[:3])}{more}")
+            flags.append(f"frames left out: {len(self.left_out)}: {some(self.left_out)}")
         flags += depth_flags(frames, metric=self.format != "sequence")
         flags += map(Doubt, self.doubts)
         if self.mask == "given":
@@ -326,7 +343,7 @@ def _from_frames(frames: Sequence[Frame], path: Path) -> Source:
         else:
             used[number] = frame
     if not used:
-        raise InputError(f"no frame can be used: {left_out[0]}")
+        raise InputError(f"no frame can be used: {some(left_out)}")
     _check_poses([frame.camera for frame in used.values()], "in memory")
     return Source(
         path,

@@ -178,12 +178,12 @@ def _pair_result(
 ) -> PairResult:
     """Collect the result, with its errors if both objects are labelled sequences of one folder."""
     first, second, *helpers = scans
-    shown = second.source.describe(second.targets)
+    shown = second.source.describe(second.targets, second.frames)
     if helpers:
         shown += f"; helpers: {', '.join(str(helper.source.path) for helper in helpers)}"
     result = PairResult(
         f"{first.source.name} to {second.source.name}",
-        (first.source.describe(first.references), shown),
+        (first.source.describe(first.references, first.frames), shown),
         first.frames[first.references[0]],
         tuple(second.frames[position] for position in second.targets),
         estimates,

@@ -125,8 +125,13 @@ def stood_up(scan: Scan, target: Scan, method: ZeroShotPose) -> tuple[Scan, int]
 def scan_flags(scans: Sequence[Scan]) -> tuple[str, ...]:
     """Flag objects of different categories, doubtful frames, and objects seen from one side."""
     flags = []
-    sources = [scan.source for scan in scans if scan.source.format == "sequence"]
-    categories = sorted({source.path.resolve().parent.name for source in sources})
+    categories = sorted(
+        {
+            scan.source.path.resolve().parent.name
+            for scan in scans
+            if scan.source.format == "sequence"
+        }
+    )
     if len(categories) > 1:
         flags.append(Doubt(f"the objects are of different categories: {', '.join(categories)}"))
     for scan in scans:

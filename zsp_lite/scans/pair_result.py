@@ -35,7 +35,8 @@ class PairResult:
     """Pose estimates of one pair by one solver, or by both. `print` shows them."""
 
     title: str  # name of the pair, such as its category
-    sources: tuple[str, str]  # where the reference and the target views come from, in words
+    # where the reference and the target views come from, in words, and the size of the objects
+    sources: tuple[str, str]
     reference: Frame  # reference frame, whole
     targets: tuple[Frame, ...]  # target frames, whole
     estimates: dict[str, PoseEstimate]  # estimate of each solver by its name, at least one
