@@ -88,7 +88,7 @@ def farther(frame: Frame) -> Frame:
     [
         (inverted, r"agree \(\d+%\) if the poses are world to camera$"),
         (flipped, "if the poses have the other axes, OpenGL's for OpenCV's or the reverse"),
-        (lambda frame: inverted(flipped(frame)), "are world to camera, and have the other axes"),
+        (lambda frame: inverted(flipped(frame)), "are world to camera in the other axes"),
         (reordered, "if the poses are from quaternions with w first"),
         (partial(scaled, 0.001), r"if the depth is taken in metres: --depth-unit 1$"),
         (partial(scaled, 5), "if the depth is taken in 1/5000 m: --depth-unit 0.0002$"),
@@ -97,7 +97,7 @@ def farther(frame: Frame) -> Frame:
         (partial(scaled, 0.26), r"by 3.8\d?: --depth-unit 0.0038"),  # no usual unit is near
         (partial(scaled, 1.15), r"by 0.8[678]\d?: --depth-unit 0.0008[678]"),
         (partial(scaled, 0.85), r"by 1.1[78]: --depth-unit 0.0011[78]"),
-        (longer, r"if the focal length is multiplied by 0.(79|83)$"),
+        (longer, r"if the focal length is multiplied by about 0.(79|83)$"),
         (
             lambda frame: scaled(1 + 0.2 * int(frame.name), frame),
             "by a factor of its own",

@@ -157,3 +157,8 @@ def test_a_gain_is_that_of_the_pairs_that_only_one_method_solves():
     assert 0 < low < 50 < high < 100
     # Of ten pairs drawn from these, with probability 0.023 no more gain than lose; twice that.
     assert result["accuracy_gain_p"] == pytest.approx(0.046, abs=0.015)
+
+
+def test_a_method_does_not_differ_from_itself():
+    same = paired_difference(np.arange(60), np.arange(60))
+    assert same == {"accuracy_gain": 0, "accuracy_gain_ci": [0, 0], "accuracy_gain_p": 1}

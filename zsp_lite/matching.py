@@ -26,10 +26,12 @@ from torch import Tensor
 
 from zsp_lite.errors import InputError
 from zsp_lite.features import FeatureMap, Grid, average_pool, bin_indices, descriptors
+from zsp_lite.io.threads import one_thread
 
 Keys = FeatureMap | Float[Tensor, "_ _ _"] | Float[np.ndarray, "_ _ _"]
 Similarities = Float[Tensor, "n1 n2"] | Float[np.ndarray, "n1 n2"]
 Mask = Bool[Tensor, "_ _"] | Bool[np.ndarray, "_ _"]
+_ROUNDS = 300  # of k-means at most; a few are enough
 Matched = tuple[Int[Tensor, " _"], Float[Tensor, " _"]]  # partner and score of each patch
 
 
@@ -338,41 +340,46 @@ def _inverse_norm(keys: Float[Tensor, "h w d"]) -> Float[Tensor, " n"]:
 
 
 def _cluster(gram: Float[np.ndarray, "m m"], k: int, seed: int) -> Int[np.ndarray, " m"]:
-    """Cluster m points, given by their inner products, by k-means; returns their labels.
+    """Cluster m points, given by their inner products, by k-means; returns their labels."""
+    # With one thread, whose rounding decides ties the same way everywhere.
+    with one_thread():
+        # Eigenvectors scaled by the roots of their eigenvalues are m points in m dimensions of the
+        # same inner products, hence the same distances: k-means on them is k-means on the
+        # descriptors of 17 D dimensions, but faster.
+        values, vectors = np.linalg.eigh(gram)
+        points = vectors * np.sqrt(np.maximum(values, 0.0))
+        points -= points.mean(0)  # for accuracy
+        centres = points[_first_centres(points, k, seed)]
+        labels = None
+        for _ in range(_ROUNDS):
+            found = cdist(centres, points).argmin(0)
+            if np.array_equal(found, labels):
+                break
+            labels = found
+            # Equal descriptors (a uniform surface) leave clusters empty: fewer matches.
+            members = labels == np.unique(labels)[:, None]
+            centres = (members / members.sum(1, keepdims=True)) @ points
+        return labels
 
-    The labels are those of scikit-learn's `KMeans`, without its second of import and in a quarter
-    of its time. The centres start by greedy k-means++: of some points drawn by their squared
-    distance to the nearest centre, the one that lowers the sum of these distances most.
-    """
-    # Eigenvectors scaled by the roots of their eigenvalues are m points in m dimensions of the same
-    # inner products, hence the same distances: k-means on them is k-means on the descriptors of
-    # 17 D dimensions, but faster.
-    values, vectors = np.linalg.eigh(gram)
-    points = vectors * np.sqrt(np.maximum(values, 0.0))
-    points -= points.mean(0)
-    # Sums as scikit-learn forms them: rounding decides ties, of which the drawn points have many.
-    squares = np.einsum("md,md->m", points, points)
-    once = np.ones(len(points))
+
+def _first_centres(points: Float[np.ndarray, "m d"], k: int, seed: int) -> list[np.int64]:
+    """Choose k of the points as first centres by greedy k-means++, with scikit-learn's draws."""
     draw = np.random.RandomState(np.random.default_rng(seed).integers(2**31))
-    drawn = draw.choice(len(points), 1, p=once / len(points))
+    once = np.ones(len(points))
+    # Sums are formed as in scikit-learn, because rounding decides ties, of which there are many.
+    squares = np.einsum("md,md->m", points, points)
+    candidates = draw.choice(len(points), 1, p=once / len(points))
     nearest = np.full(len(points), np.inf)  # squared distances to the nearest centre
     centres = []
-    while len(centres) < k:
-        if centres:
-            shares = draw.uniform(size=2 + int(np.log(k)))
-            drawn = np.searchsorted(nearest.cumsum(), shares * (nearest @ once))
-            drawn = drawn.clip(max=len(points) - 1)
-        apart = squares[drawn, None] - 2 * points[drawn] @ points.T + squares
+    while True:
+        apart = squares[candidates, None] - 2 * points[candidates] @ points.T + squares
         closer = np.minimum(nearest, apart.clip(0))
+        # The candidate that lowers the sum most becomes a centre.
         best = (closer @ once).argmin()
         nearest = closer[best]
-        centres.append(drawn[best])
-    centres = points[centres]
-    labels = None
-    while True:
-        found = cdist(centres, points).argmin(0)
-        if np.array_equal(found, labels):
-            return found
-        labels = found
-        members = labels == np.unique(labels)[:, None]
-        centres = (members / members.sum(1, keepdims=True)) @ points
+        centres.append(candidates[best])
+        if len(centres) == k:
+            return centres
+        shares = draw.uniform(size=2 + int(np.log(k)))
+        candidates = np.searchsorted(nearest.cumsum(), shares * (nearest @ once))
+        candidates = candidates.clip(max=len(points) - 1)

@@ -41,7 +41,7 @@ from zsp_lite.minimal import (
 )
 
 FILE = "my_method.py"  # in the current folder
-SECONDS = 10.0  # that a part has for all its tests
+SECONDS = 10.0  # of computing, that a part has for all its tests
 TRIALS = 1000  # of the library's RANSAC
 # What a kept file begins with: the library's parts, which those of the student replace.
 HEADER = '''\

@@ -49,9 +49,9 @@ _FINE = np.linspace(0.95, 1.05, 11)  # in steps of 1 %, around the best of the o
 # at least 1.4 times without noise.
 _SCALE_GAIN = 1.35
 # The right focal length makes the closeness in the mean at least so many times as great as any
-# factor of the depth, such as 1. On renderings with the noise of phones, where the intrinsics are
-# right, none does so and raises the closeness in each pair; of 40 focal lengths that are 1.25 times
-# as long, 35 are found.
+# factor of the depth, such as 1, and raises it in each pair. On renderings with the noise of phones
+# and right intrinsics no factor does both; of 40 focal lengths that are 1.25 times as long, 35 are
+# found.
 _FOCAL_GAIN = 1.07
 _OWN_SCALES = np.geomspace(0.4, 2.5, 39)  # of a single frame
 
@@ -177,8 +177,8 @@ def disagreement(frames: Iterable[Frame], unit: float | None = None) -> str:
         )
     ):
         return Contradiction(
-            f"{found}; they agree best ({share:.0%}) if the focal length is multiplied by "
-            f"{focal:.2g}"
+            f"depth and poses agree better ({share:.0%} of the object's points, not {given:.0%}) "
+            f"if the focal length is multiplied by about {focal:.2g}"
         )
 
     # Depth along the ray changes little on the object alone, which is near the optical axis: the
@@ -307,11 +307,14 @@ _OTHER_AXES = (
     "have the other axes, OpenGL's for OpenCV's or the reverse: negate the columns y and z"
 )
 _INVERSE = "are world to camera"
+_INVERSE_OPENGL = (
+    "are world to camera in the other axes: invert them, then negate the columns y and z"
+)
 # Corrections from wrong to right world-to-camera matrices, the likeliest first. The axes of the
 # world do not matter.
 _CORRECTIONS: list[tuple[str, _Correction]] = [
     (_INVERSE, np.linalg.inv),
-    (f"{_INVERSE}, and {_OTHER_AXES}", lambda pose: FROM_OPENGL @ np.linalg.inv(pose)),
+    (_INVERSE_OPENGL, lambda pose: FROM_OPENGL @ np.linalg.inv(pose)),
     (_OTHER_AXES, lambda pose: FROM_OPENGL @ pose),
     ("are from quaternions with w first", _reorder),
 ]

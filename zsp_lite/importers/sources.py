@@ -104,7 +104,7 @@ class Source:
                 # Single points may be off the object.
                 low, middle, high = np.percentile(points[near_median(points)], [1, 50, 99], axis=0)
                 return (
-                    f"; by depth and intrinsics, the object in {frame.name or 'the first frame'} "
+                    f"; by depth and intrinsics, the object in {frame.name or 'a frame'} "
                     f"is {(high - low)[0]:.3g}{unit} wide and {middle[2]:.3g}{unit} away"
                 )
         return ""
