@@ -7,7 +7,9 @@ import subprocess
 import sys
 from pathlib import Path
 
+import jaxtyping
 import pytest
+import typechecking
 from hypothesis import settings
 from jaxtyping import config, install_import_hook
 
@@ -20,10 +22,17 @@ settings.load_profile("no deadline")
 # The hook must precede the first import of zsp_lite. `make check` leaves it out, to be quick.
 if os.environ.get("ZSP_LITE_CHECK_ANNOTATIONS") != "0":
     install_import_hook("zsp_lite", "typechecking.typechecker")
+    jaxtyping.jaxtyped = typechecking.first_calls
 
 from zsp_lite.errors import FatalError, InputError  # noqa: E402
 
 _raises = pytest.raises
+
+
+@pytest.fixture(scope="module", autouse=True)
+def first_calls():
+    """Check the first calls of each file."""
+    typechecking.calls.clear()
 
 
 @contextlib.contextmanager

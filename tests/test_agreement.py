@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from synthetic_views import ELSEWHERE, look_at, render
 
 from zsp_lite import Frame
-from zsp_lite.importers.agreement import disagreement
+from zsp_lite.importers.agreement import _scaled, disagreement
 
 FLIP = np.diag([1.0, -1, -1, 1])  # y and z of OpenGL's cameras are those of OpenCV's, reversed
 DEPTH_UNIT = 0.001  # metres per stored value of depth
@@ -108,6 +108,10 @@ def farther(frame: Frame) -> Frame:
 def test_each_mistake_is_named(four_frames, mistake, message):
     line = disagreement([mistake(frame) for frame in four_frames], DEPTH_UNIT)
     assert re.search(message, line)
+
+
+def test_a_unit_is_not_named_in_place_of_itself():
+    assert _scaled(1.03, 1.0, DEPTH_UNIT).endswith("by 1.03: --depth-unit 0.00103")
 
 
 def test_right_frames_agree(four_frames):

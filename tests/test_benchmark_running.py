@@ -198,7 +198,7 @@ def row(problem):
 def test_an_interrupt_ends_a_run_and_its_workers_with_one_line(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "waiting_rows.py").write_text(WAITS)
-    options = "--pairs 12 --out run --methods waits=waiting_rows:row"
+    options = "--pairs 4 --out run --methods waits=waiting_rows:row"
     words = f"benchmark --data {small_folder()} {options}".split()
     command = [sys.executable, "-m", "zsp_lite", *words, "--workers", "2"]
     with subprocess.Popen(
@@ -216,7 +216,7 @@ def test_an_interrupt_ends_a_run_and_its_workers_with_one_line(tmp_path, monkeyp
         assert process.communicate()[1] == "zsp-lite: interrupted\n"
     assert process.returncode == 130
     stored = pairs_in(tmp_path / "run")
-    assert 0 < len(stored) < 24
+    assert 0 < len(stored) < 8
     (tmp_path / "go").touch()
     assert main(words) == 0  # an interrupted run can be continued
     assert pairs_in(tmp_path / "run")[: len(stored)] == stored

@@ -4,7 +4,6 @@ are refused, and which frames are left out."""
 import json
 import re
 import shutil
-import sys
 import zipfile
 from collections.abc import Callable
 from dataclasses import replace
@@ -559,10 +558,14 @@ def test_the_sharpest_image_of_each_part_is_chosen(tmp_path, views, layout):
     assert [frame.number for frame in open_capture(path, count=3).frames] == [0, 3, 8]
 
 
-def test_a_scan_of_record3d_is_refused_without_its_package(tmp_path, views, monkeypatch):
-    path, _ = write("record3d", tmp_path / "scan", views)
-    monkeypatch.setitem(sys.modules, "lzfse", None)
-    refused("compressed by LZFSE, expected its package: pip install lzfse", open_capture, path)
+def test_images_without_a_pose_or_a_file_are_left_out(tmp_path, views):
+    folder = tmp_path / "scan"
+    write("record3d", folder, views)
+    edited(lambda c: c["poses"].pop(), name="metadata")(folder)
+    left_out = open_capture(folder).left_out
+    assert left_out == ["rgbd/3.jpg: no pose in metadata"]
+    shutil.rmtree(folder / "rgbd")
+    refused("none of 3 frames can be used", open_capture, folder, masks=tmp_path)
 
 
 def test_a_scan_of_record3d_without_tracking_is_refused(tmp_path):

@@ -3,8 +3,10 @@ and names of files."""
 
 import json
 import re
+import shutil
 from dataclasses import replace
 from functools import partial
+from tempfile import gettempdir
 
 import numpy as np
 import open3d as o3d
@@ -115,10 +117,11 @@ def test_frames_that_are_dark_or_damaged_are_left_out(tmp_path, views):
     write(tmp_path, [*views[:3], dark, *views[4:7]])
     (tmp_path / "rgb/000005.jpg").write_bytes(b"damaged")
     (tmp_path / "depth/000006.png").unlink()
-    source = open_recording(tmp_path)
+    source = open_recording(shutil.make_archive(tmp_path / "scan", "zip", tmp_path))
     # Frames 3, 5 and 6 are bad.
     assert errors(source, [*views[:3], views[4]])[0] < 1
     left_out = " ".join(source.left_out)
+    assert gettempdir() not in left_out  # where the zip is unpacked
     for reason in (
         "000003.jpg on, 1 of 6 do not join",
         "000005.jpg",
@@ -172,14 +175,16 @@ def test_recorders_of_open3d_and_redwood_need_no_option(tmp_path, views):
     recorder = write(tmp_path / "open3d", views[:3], "color/{:05d}.jpg depth/{:05d}.png")
     fx, fy, cx, cy = INTRINSICS
     matrix = [fx, 0, 0, 0, fy, 0, cx - 0.5, cy - 0.5, 1]
-    (recorder / "intrinsic.json").write_text(json.dumps({"intrinsic_matrix": matrix}))
+    (recorder / "camera_intrinsic.json").write_text(json.dumps({"intrinsic_matrix": matrix}))
     assert errors(open_source(recorder), views[:3])[0] < 1
 
     # Redwood's images are of 640 x 480 pixels. Depth has other times.
     redwood = tmp_path / "redwood"
     write(redwood, views[:3], "rgb/{:07d}-{:09d}000.jpg depth/{:07d}-{:09d}400.png", enlarge=4)
+    (redwood / "rgb.txt").touch()  # as in TUM's benchmark, whose poses are missing
     source = open_source(redwood)
     assert errors(source, views[:3])[0] < 1
+    assert "PrimeSense" in flags(source)
     assert_allclose(source.cameras[0].K, [[525, 0, 320], [0, 525, 240], [0, 0, 1]])
 
 

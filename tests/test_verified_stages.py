@@ -31,7 +31,6 @@ from zsp_lite.verified.soft_icp import soft_icp
 from zsp_lite.verified.verification import (
     TERM_NAMES,
     ScoreCoefficients,
-    _averages,
     score_terms,
 )
 from zsp_lite.views import View
@@ -182,32 +181,6 @@ def test_soft_icp_approaches_the_true_pose_and_keeps_it(scene, truth):
     assert float(rotation_angles(start.rotation, truth.rotation)) > 20
     assert errors.max() < 10
     assert (aligned.scale / truth.scale - 1).abs().max() < 0.12
-
-
-def test_terms_of_two_points_in_three_views_by_hand(scene):
-    # A row for each view. The first point is on the surface in two views, in the second of them
-    # outside the silhouette. The second point is behind the surface, and in front of it where it
-    # meets no patch. The third view has no known depth.
-    behind = torch.tensor([[0, 0.25], [0, -0.5], [-5, -5]])
-    weight = torch.tensor([[1, 1], [0.8, 0.8], [0, 0]])
-    outside = torch.tensor([[0, 0], [1, 0.25], [0, 0]])
-    patch = torch.tensor([[3, 5], [4, -1], [3, 3]])
-    projection = (2 + behind, torch.full((3, 2), 2.0), weight, outside, patch.int())
-    rows = torch.tensor([0, scene.similarity.shape[1]])
-    found = _averages(
-        scene, tuple(part[None] for part in projection), rows, 1, torch.tensor([1.0, 3.0])
-    )
-    near = np.exp(-0.5)  # weight of a point 0.25, one standard deviation, behind the surface
-    s = scene.similarity.numpy()
-    # A sum of similarities is divided by that of the weights and 0.5: by 2.3 for the first point.
-    # The points have a quarter and three quarters of the weight.
-    expected = [
-        (s[0, 3] + 0.8 * s[0, 4]) / 2.3 / 4 + 0.75 * near * s[1, 5] / (near + 0.5),
-        1 / 4 + 0.75 * near,
-        (1 / 4 + 0.75 * 0.5) / 3,
-        0.75 * 0.8 * 0.5 / 3,
-    ]
-    assert_allclose([float(term) for term in found], expected, rtol=1e-5)
 
 
 def test_the_truth_scores_above_other_poses(scene, truth):

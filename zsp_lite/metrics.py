@@ -76,8 +76,8 @@ def median(errors: ArrayLike, weights: ArrayLike | None = None) -> np.ndarray | 
     order = np.argsort(errors)
     cumulative = np.cumsum(np.take(weights, order, axis=-1), axis=-1)
     half = cumulative[..., -1:] / 2
-    lower = (cumulative < half).sum(axis=-1)
-    upper = (cumulative <= half).sum(axis=-1)
+    lower = (cumulative >= half).argmax(axis=-1)
+    upper = (cumulative > half).argmax(axis=-1)
     ordered = errors[order]
     return ((ordered[lower] + ordered[upper]) / 2)[()]
 
@@ -86,5 +86,4 @@ def weighted_mean(values: ArrayLike, weights: ArrayLike | None) -> np.ndarray | 
     """Compute the mean over the last axis, weighted unless `weights` is None."""
     if weights is None:
         return np.mean(values, axis=-1)
-    weights = np.asarray(weights)
-    return (weights * values).sum(axis=-1) / weights.sum(axis=-1)
+    return np.einsum("...n,...n", weights, values) / np.sum(weights, axis=-1)

@@ -30,8 +30,12 @@ def summarise(table: pd.DataFrame) -> dict[str, Any]:
     ours = table[table["row"] == "ours"]
     methods = {}
     against = {}
+    draws: dict[tuple[str, ...], Draws] = {}  # rows of the same problems have the same
     for name, row in table.groupby("row", sort=False):
-        drawn = draws_of(row)
+        problems = tuple(row["problem"])
+        if problems not in draws:
+            draws[problems] = draws_of(row)
+        drawn = draws[problems]
         methods[name] = _summarise_row(row, drawn)
         common = ours[ours["repeat"].isin(row["repeat"])]
         if name != "ours" and row["problem"].tolist() == common["problem"].tolist():

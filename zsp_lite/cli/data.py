@@ -281,10 +281,9 @@ def import_(scan, root, category, sequence, mask, box, **options) -> None:
 
     A capture is images with depth and camera poses in one world. SCAN is a folder, or the zip file
     that an app has exported. Its format is recognised: nerfstudio (also of Blender, NeRFCapture and
-    instant-ngp), stray (Stray Scanner), polycam (its raw data), record3d
-    (needs `pip install lzfse`), tum (RGB-D benchmark), bop, scannet, open3d (recorder, with the
-    trajectory of its reconstruction), recording (rgb/ or color/, and depth/, whose poses Open3D
-    finds), or lists of your own:
+    instant-ngp), stray (Stray Scanner), polycam (its raw data), record3d, tum
+    (RGB-D benchmark), bop, scannet, open3d (recorder, with the trajectory of its reconstruction),
+    recording (rgb/ or color/, and depth/, whose poses Open3D finds), or lists of your own:
 
     \b
       rgb.txt, depth.txt  one file per line; depth as 16-bit PNG, TIFF, .npy, ...

@@ -259,7 +259,6 @@ def _defect(name: str, source: str) -> str:
     _seed.set(0)
     function = _define(name, source, _executed(HEADER))
     test = _TESTS[name]
-    end = time.thread_time() + SECONDS
     cases = [
         {key: np.array(value) if isinstance(value, list) else value for key, value in case.items()}
         for case in test["cases"]
@@ -267,6 +266,7 @@ def _defect(name: str, source: str) -> str:
     # Of `estimate` the file has none: a toy pair, without noise and with it.
     cases = cases or [{"problem": _toy_problem(noise)} for noise in (0, 0.05)]
     expected = [_outcome(_PARTS[name], case) for case in cases]
+    end = time.thread_time() + SECONDS
     found = [_outcome(function, case, end) for case in cases]
     if any(isinstance(came, TimeoutError) for came in found):
         return f"{name} was stopped after {SECONDS:.0f} s: does a loop never end?"

@@ -73,11 +73,11 @@ FORMATS = {
         ("intrinsics",),
         # Signs of other formats: poses that they have are not to be found again.
         unless=(
-            *("scene*", "pose", "groundtruth.txt", "rgb.txt", "trajectory.log", "depth/*.exr"),
+            *("scene*", "pose", "groundtruth.txt", "trajectory.log", "depth/*.exr"),
             *_COLMAP,
         ),
     ),
-    "open3d": Format(("intrinsic.json", "color"), "Open3D's recorder", read_open3d),
+    "open3d": Format(("*intrinsic.json", "color"), "Open3D's recorder", read_open3d),
 }
 _HOW = (
     "expected raw data with depth and poses, as Stray Scanner, Record3D or Polycam export them "
@@ -110,7 +110,7 @@ _OTHERS = (
     (
         ("depth/*.exr",),
         "has depth/*.exr, as Record3D's EXR + JPG export, which no library here decodes",
-        "expected Record3D's .r3d export, or the depth as .npy or a float .tiff",
+        "expected Record3D's .r3d export",
     ),
     (
         _COLMAP,
@@ -233,7 +233,8 @@ def open_capture(
         except OutsideError:
             raise
         except (InputError, OSError) as error:  # OSError for a name that is too long
-            left_out.append(str(error))
+            # A zip is unpacked to a temporary folder.
+            left_out.append(str(error).replace(f"{folder.parent}/", ""))
     frames.sort(key=lambda frame: natural_order(frame.image))
 
     # The number of a frame is the last one in its image's name, or 0; of a long number, the last 15
@@ -249,7 +250,7 @@ def open_capture(
     if folder.is_file():
         folder = folder.parent
     paths = find_masks(masks or folder / "masks", images)
-    if masks is not None and not any(paths):
+    if masks and frames and not any(paths):
         raise InputError(
             f"--masks {masks} has no mask that is named like an image, such as {images[0].stem}.png"
         )
@@ -263,8 +264,8 @@ def open_capture(
     sharp = sharpest(frames, count, lambda frame: frame.load().rgb, left_out)
     frames = [frame for frame, _ in sharp]
     if not frames:
-        problem = "no frame, expected some"
-        if left_out:
-            problem = f"none of {len(left_out)} frames can be used: {some(left_out)}"
-        raise InputError(f"capture {folder.resolve().name}: {problem}")
+        raise InputError(
+            f"capture {folder.resolve().name}: none of {len(left_out)} frames can be used: "
+            f"{some(left_out)}"
+        )
     return Capture(frames, left_out)

@@ -171,10 +171,8 @@ def disagreement(frames: Iterable[Frame], unit: float | None = None) -> str:
         len(pairs) > 2
         and share > _AGREEING
         and (refocused > closeness_by()).all()
-        and all(
-            refocused.sum() > _FOCAL_GAIN * closeness_by(scale=scale).sum()
-            for scale in (1.0, *_SMALL_SCALES)
-        )
+        and refocused.sum()
+        > _FOCAL_GAIN * max(closeness_by(scale=scale).sum() for scale in (1.0, *_SMALL_SCALES))
     ):
         return Contradiction(
             f"depth and poses agree better ({share:.0%} of the object's points, not {given:.0%}) "
@@ -285,8 +283,8 @@ def _scaled(factor: float, distance: float, unit: float | None) -> str:
     if not unit:
         return f"the depth is multiplied by {factor:.3g}"
     new = factor * unit
-    # A unit within 4 % of a usual one is that.
-    new = next((usual for usual in _UNITS if abs(usual / new - 1) < 0.04), new)
+    # A unit within 4 % of a usual one, but for that of now, is that.
+    new = next((one for one in _UNITS if abs(one / new - 1) < 0.04 and one != unit), new)
     # The depth is right if its factor would make a plausible distance of the object implausible.
     nearest, farthest = PLAUSIBLE
     if nearest <= distance <= farthest and not nearest <= distance * new / unit <= farthest:

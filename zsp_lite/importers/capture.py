@@ -29,6 +29,11 @@ from zsp_lite.io.files import read_bytes, shown
 
 # OpenCV's and Open3D's pixel centres are at integers: their principal points are smaller by this.
 HALF_PIXEL = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
+# The camera of TUM's benchmark and of Redwood's scans, where none is given.
+PRIMESENSE = {
+    "intrinsics": (525.0, 525.0, 320.0, 240.0),
+    "doubt": "no --intrinsics FX,FY,CX,CY: the camera is taken for TUM's and Redwood's PrimeSense",
+}
 FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])  # from OpenGL's camera: +y up, looking along -z
 # Greater depth counts as unknown, such as Blender's 1e10; in units of the world.
 _FARTHEST = 1e4

@@ -6,11 +6,17 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial import cKDTree
 
+from zsp_lite.data.cameras import Values
 from zsp_lite.errors import InputError
-from zsp_lite.importers.capture import Makers, make_frame, read_numbers, read_text_lines, refuse
+from zsp_lite.importers.capture import (
+    PRIMESENSE,
+    Makers,
+    make_frame,
+    read_numbers,
+    read_text_lines,
+    refuse,
+)
 
-# The benchmark's default, with pixel centres at half-integers.
-_TUM_INTRINSICS = (525.0, 525.0, 320.0, 240.0)
 _TUM_UNIT = 1 / 5000  # metres per stored depth value
 _TUM_TOLERANCE = 0.02  # seconds between an image and its depth
 
@@ -31,15 +37,12 @@ def read_lists(folder: Path) -> Makers:
         intrinsics = [intrinsics.squeeze()] * len(poses)
     if len(set(images)) < len(images):
         raise InputError(f"{folder}/rgb.txt names a picture twice, expected another in each line")
-    counts = {
-        "rgb.txt": len(images),
-        "depth.txt": len(depths),
-        "poses.txt": len(poses),
-        "intrinsics": len(intrinsics),
-    }
-    if len(set(counts.values())) > 1:
-        found = ", ".join(f"{name} {count}" for name, count in counts.items())
-        raise InputError(f"capture {folder}: the lists have lines: {found}; expected equal numbers")
+    lines = [len(images), len(depths), len(poses), len(intrinsics)]
+    if len(set(lines)) > 1:
+        raise InputError(
+            f"capture {folder}: rgb.txt, depth.txt, poses.txt and the intrinsics have {lines} "
+            "lines, expected equal numbers"
+        )
     for line, names in enumerate(zip(images, depths)):
         where = f"capture {folder}, line {line + 1} of the lists"
         yield partial(
@@ -53,17 +56,12 @@ def read_lists(folder: Path) -> Makers:
         )
 
 
-def read_tum(
-    folder: Path, intrinsics: tuple[float, float, float, float] = _TUM_INTRINSICS
-) -> Makers:
+def read_tum(folder: Path, intrinsics: Values | None = None) -> Makers:
     """Read a sequence of TUM's RGB-D benchmark: images with the nearest depth and pose in time."""
+    camera = PRIMESENSE if intrinsics is None else {"intrinsics": intrinsics}
     poses = read_numbers(folder / "groundtruth.txt", (8,))
-    image_list = folder / "rgb.txt"
-    depth_list = folder / "depth.txt"
-    times = read_numbers(image_list, (1,), usecols=0)[:, 0]
-    depth_times = read_numbers(depth_list, (1,), usecols=0)[:, 0]
-    images = [line.split(maxsplit=1)[-1] for line in read_text_lines(image_list)]
-    depths = [line.split(maxsplit=1)[-1] for line in read_text_lines(depth_list)]
+    times, images = _read_times(folder / "rgb.txt")
+    depth_times, depths = _read_times(folder / "depth.txt")
     for time, image, depth, pose in zip(
         times, images, _nearest(depth_times, times), _nearest(poses[:, 0], times)
     ):
@@ -76,10 +74,16 @@ def read_tum(
             image,
             depths[depth],
             poses[pose, 1:],
-            intrinsics,
-            f"{folder}, time {time:.6f}",
+            where=f"{folder}, time {time:.6f}",
             depth_unit=_TUM_UNIT,
+            **camera,
         )
+
+
+def _read_times(path: Path) -> tuple[np.ndarray, list[str]]:
+    """Read the times and names of a list of files."""
+    names = [line.split(maxsplit=1)[-1] for line in read_text_lines(path)]
+    return read_numbers(path, (1,), usecols=0)[:, 0], names
 
 
 def _nearest(times: np.ndarray, wanted: np.ndarray) -> list[int]:

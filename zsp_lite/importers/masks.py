@@ -25,7 +25,7 @@ from zsp_lite.points import object_pixels, sampling_step, standard_deviation, wo
 # Masks by colours.
 _ITERATIONS = 4  # number of GrabCut's iterations
 # Longest side in pixels of the image for GrabCut, whose time is proportional to the area.
-_LONGEST_SIDE = 320
+_LONGEST_SIDE = 160
 _PADDING = 0.1  # of the projected bounding box, relative to its longer side
 _SMALLEST_BOX = 4  # least side of a box, pixels
 # Distance of the ball's centre behind the visible surface, relative to the ball's radius.

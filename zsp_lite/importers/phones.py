@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import cv2
+import lzfse
 import msgspec
 import numpy as np
 from jaxtyping import Float
@@ -152,6 +153,8 @@ def read_record3d(folder: Path) -> Makers:
     for number in range(len(scan.poses)):
         intrinsics = every[number] if number < len(every) else []
         yield partial(_make_record3d, folder, unpacked / f"{number}", scan, intrinsics)
+    for number in range(len(scan.poses), len([*folder.glob("rgbd/*.jpg")])):
+        yield partial(refuse, f"rgbd/{number}.jpg: no pose in metadata")
 
 
 def _make_record3d(
@@ -183,12 +186,6 @@ def _make_record3d(
 
 def _decompressed(path: Path, kind: type, scan: _Record3D) -> np.ndarray:
     """Decompress a map (dh, dw) of numbers of a type by LZFSE."""
-    try:
-        import lzfse
-    except ImportError as error:
-        raise InputError(
-            f"{path.name} is compressed by LZFSE, expected its package: pip install lzfse"
-        ) from error
     data = read_bytes(path, "depth")
     try:
         # Compressed, a map may be a little larger, not twice as large.

@@ -20,14 +20,19 @@ from zsp_lite.data.cameras import Values
 from zsp_lite.data.frames import Frame
 from zsp_lite.errors import InputError, real_array
 from zsp_lite.importers import files
-from zsp_lite.importers.capture import HALF_PIXEL, CaptureFrame, Makers, make_frame, refuse
+from zsp_lite.importers.capture import (
+    HALF_PIXEL,
+    PRIMESENSE,
+    CaptureFrame,
+    Makers,
+    make_frame,
+    refuse,
+)
 from zsp_lite.io.files import read_json
 from zsp_lite.metrics import rotation_angle
 from zsp_lite.points import world_points
 
 RECORDED = "[rc]*[br]"  # pattern of the images' folder, rgb or color
-# The camera of "A Large Dataset of Object Scans", whose images are named FRAME-TIME.
-_REDWOOD = (525.0, 525.0, 320.0, 240.0)  # pixel centres at half-integers
 _MOST = 600  # of more frames, every second one is tracked, or every third, ...
 _LONGEST_SIDE = 320  # pixels of the images that are tracked
 _BACK = 3  # a frame is joined to one of so many before it
@@ -52,9 +57,14 @@ def read_recording(
     """
     images = _numbered(folder, RECORDED)
     depths = _numbered(folder, "depth")
-    camera = {"intrinsics": intrinsics}
-    if intrinsics is None:
-        camera = _known_camera(folder, min(images.values()))  # any image tells
+    image = min(images.values())  # any of them tells
+    if intrinsics is not None:
+        camera = {"intrinsics": intrinsics}
+    # Redwood's images are named FRAME-TIME.
+    elif re.fullmatch(r"\d+-\d+", image.stem) and files.picture_size(image) == (480, 640):
+        camera = PRIMESENSE
+    else:
+        camera = open3d_camera(folder)
     # The numbers are of frames or times: an image and its depth have the same, or nearly. They
     # differ by at most 3/4 of the mean distance between images.
     numbers = np.array([*depths])
@@ -94,22 +104,15 @@ def _numbered(folder: Path, name: str) -> dict[float, Path]:
     return dict(sorted(numbered.items()))
 
 
-def _known_camera(folder: Path, image: Path) -> dict[str, Any]:
-    """Return the camera of Open3D's file, or that of Redwood."""
-    if (folder / "intrinsic.json").is_file():
-        return open3d_camera(folder)
-    if re.fullmatch(r"\d+-\d+", image.stem) and files.picture_size(image) == (480, 640):
-        return {"intrinsics": _REDWOOD}
-    raise InputError(
-        f"{folder} has no intrinsics, expected --intrinsics FX,FY,CX,CY in pixels, or Open3D's "
-        "intrinsic.json"
-    )
-
-
 def open3d_camera(folder: Path) -> dict[str, Any]:
     """Read the intrinsics, stored in column-major order, and the distortion of Open3D's
     recorders."""
-    path = folder / "intrinsic.json"
+    path = next(folder.glob("*intrinsic.json"), None)  # camera_intrinsic.json of its examples
+    if not path:
+        raise InputError(
+            f"{folder} has no intrinsics, expected --intrinsics FX,FY,CX,CY in pixels, or Open3D's "
+            "intrinsic.json"
+        )
     camera = read_json(path, dict[str, Any], "capture")
     matrix = real_array(f"{path}: intrinsic_matrix", camera.get("intrinsic_matrix"), (9,))
     return {
@@ -233,9 +236,9 @@ def _track(makers: list[Callable[..., CaptureFrame]], name: str) -> Makers:
     )
     # Open3D has removed loops that contradict the rest.
     closed = sum(edge.uncertain for edge in graph.edges)
-    doubt = ""
+    doubt = {}
     if closed < len(loops) / 4:
-        doubt = f"the poses may drift: {closed} of {len(loops)} loops close"
+        doubt["doubt"] = f"the poses may drift: {closed} of {len(loops)} loops close"
     for position, node in zip(order, graph.nodes):
         # The translation, the last column, back in the units of the depth.
-        yield partial(makers[position], node.pose[:3] * [1, 1, 1, unit], doubt=doubt)
+        yield partial(makers[position], node.pose[:3] * [1, 1, 1, unit], **doubt)

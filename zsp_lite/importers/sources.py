@@ -390,8 +390,6 @@ def _from_capture(path: Path, layout: str, place: Path, options: dict[str, Any])
     # Intrinsics may differ from frame to frame: a doubt about them is said once.
     questioned = [question_intrinsics(camera, str(path)) for camera in cameras]
     doubts = [next(filter(None, questioned), ""), *{frame.doubt for frame in frames}]
-    if layout == "tum" and "intrinsics" not in options:
-        doubts.append("no --intrinsics FX,FY,CX,CY: the camera is taken for TUM's")
     return Source(
         path,
         layout,
