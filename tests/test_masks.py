@@ -107,10 +107,10 @@ def test_the_photographed_motorcycle_is_found():
 
 def test_separating_colours_on_a_smaller_copy_does_not_shift_the_mask():
     off = []
-    # The copy has a third of the rows, 160: try all three positions.
-    for first in (150, 151, 152):
-        inside = np.zeros((480, 480), bool)
-        inside[first : first + 180, first : first + 180] = True
+    # The copy has a third of the rows, 320: try all three positions.
+    for first in (300, 301, 302):
+        inside = np.zeros((960, 960), bool)
+        inside[first : first + 360, first : first + 360] = True
         rgb = np.where(inside[..., None], np.uint8([180, 60, 60]), np.uint8(120))
         off.append(np.argwhere(separate_colours(rgb, inside)).mean() - np.argwhere(inside).mean())
     assert np.mean(off) == pytest.approx(0, abs=0.2)

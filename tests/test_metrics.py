@@ -13,7 +13,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from refusals import refused
 from scipy.spatial.transform import Rotation
 
-from zsp_lite.benchmark.statistics import bootstrap_ci, object_draws
+from zsp_lite.benchmark.statistics import bootstrap_ci, multiplicities, object_draws
 from zsp_lite.benchmark.summary import figures_of, paired_difference, summarise
 from zsp_lite.metrics import accuracy, median, rotation_error
 
@@ -151,7 +151,7 @@ def test_a_gain_is_that_of_the_pairs_that_only_one_method_solves():
     # 6 pairs only the second solves, 1 only the first.
     first = np.r_[[90.0] * 6, 10.0, [5.0] * 3]
     second = np.r_[[10.0] * 6, 90.0, [5.0] * 3]
-    result = paired_difference(first, second)
+    result = paired_difference(first, second, 1.0 * multiplicities(10, np.random.default_rng(0)))
     assert result["accuracy_gain"] == pytest.approx(50)
     low, high = result["accuracy_gain_ci"]
     assert 0 < low < 50 < high < 100
@@ -160,5 +160,5 @@ def test_a_gain_is_that_of_the_pairs_that_only_one_method_solves():
 
 
 def test_a_method_does_not_differ_from_itself():
-    same = paired_difference(np.arange(60), np.arange(60))
+    same = paired_difference(np.arange(60), np.arange(60), np.ones((9, 60)))
     assert same == {"accuracy_gain": 0, "accuracy_gain_ci": [0, 0], "accuracy_gain_p": 1}

@@ -30,12 +30,10 @@ def summarise(table: pd.DataFrame) -> dict[str, Any]:
     ours = table[table["row"] == "ours"]
     methods = {}
     against = {}
-    draws: dict[tuple[str, ...], Draws] = {}  # rows of the same problems have the same
+    draws = {}  # by problems: rows of the same ones have the same
     for name, row in table.groupby("row", sort=False):
         problems = tuple(row["problem"])
-        if problems not in draws:
-            draws[problems] = draws_of(row)
-        drawn = draws[problems]
+        drawn = draws[problems] = draws[problems] if problems in draws else draws_of(row)
         methods[name] = _summarise_row(row, drawn)
         common = ours[ours["repeat"].isin(row["repeat"])]
         if name != "ours" and row["problem"].tolist() == common["problem"].tolist():
@@ -115,7 +113,7 @@ _FIGURES: dict[str, Callable[..., Any]] = {
 }
 
 
-def paired_difference(first: ArrayLike, second: ArrayLike, weights: Draws | None = None) -> dict:
+def paired_difference(first: ArrayLike, second: ArrayLike, weights: Draws) -> dict:
     """Measure by how much the second method is more accurate than the first on the same pairs.
 
     Errors (n,) are in degrees; a pair is solved below 30.
@@ -126,8 +124,6 @@ def paired_difference(first: ArrayLike, second: ArrayLike, weights: Draws | None
     first = np.asarray(first, np.float64)
     second = np.asarray(second, np.float64)
     gain = 100.0 * (second < 30) - 100.0 * (first < 30)
-    if weights is None:
-        weights = multiplicities(len(gain), np.random.default_rng(0))
     # Rounding errors must not hide a difference of 0.
     replicates = weighted_mean(gain, weights).round(9)
     # Two-sided: twice the share of replicates on the rarer side, the data themselves counted in.

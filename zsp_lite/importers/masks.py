@@ -24,8 +24,6 @@ from zsp_lite.points import object_pixels, sampling_step, standard_deviation, wo
 
 # Masks by colours.
 _ITERATIONS = 4  # number of GrabCut's iterations
-# Longest side in pixels of the image for GrabCut, whose time is proportional to the area.
-_LONGEST_SIDE = 160
 _PADDING = 0.1  # of the projected bounding box, relative to its longer side
 _SMALLEST_BOX = 4  # least side of a box, pixels
 # Distance of the ball's centre behind the visible surface, relative to the ball's radius.
@@ -145,13 +143,16 @@ def separate_colours(
     rgb: UInt8[np.ndarray, "h w 3"],
     possible: Bool[np.ndarray, "h w"],
     certain: Bool[np.ndarray, "h w"] | bool = False,
+    longest: int = 320,
 ) -> Bool[np.ndarray, "h w"]:
-    """Select the foreground by GrabCut: the `certain` pixels, and some of the `possible` ones."""
+    """Select the foreground by GrabCut: the `certain` pixels, and some of the `possible` ones.
+
+    It sees a copy whose longer side has at most `longest` pixels: its time goes with the area.
+    """
     height, width = possible.shape
     labels = np.where(possible, cv2.GC_PR_FGD, cv2.GC_BGD)
     labels = np.where(certain, cv2.GC_FGD, labels).astype(np.uint8)
-    # GrabCut works on a smaller copy of a large image.
-    shrink = max(1, max(height, width) / _LONGEST_SIDE)
+    shrink = max(1, max(height, width) / longest)
     size = (max(1, round(width / shrink)), max(1, round(height / shrink)))
     bgr = cv2.resize(rgb[..., ::-1], size, interpolation=cv2.INTER_AREA)
     small = cv2.resize(labels, size, interpolation=cv2.INTER_NEAREST_EXACT)
@@ -476,7 +477,7 @@ def _colours_around(
     possible[inner] = frame.depth[inner] == 0 if certain else True
     separated = np.zeros_like(mask)
     separated[context] = separate_colours(
-        frame.rgb[context], possible[context], mask[context] & certain
+        frame.rgb[context], possible[context], mask[context] & certain, 160
     )
     return separated
 
