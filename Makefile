@@ -50,7 +50,7 @@ test: lint
 	OMP_NUM_THREADS=1 $(RUN) -m pytest -n 2 --dist loadfile --no-loadscope-reorder --nbval-lax --nbval-current-env \
 	  --nbval-cell-timeout=600 --durations=10 $(wildcard notebooks) tests
 
-# Quick: without the checks of annotations, which slow every call.
+# Quick: without the checks of annotations.
 check: $(STAMP)
 	OMP_NUM_THREADS=1 ZSP_LITE_CHECK_ANNOTATIONS=0 $(RUN) -m pytest -n 2 --dist loadfile -p no:nbval -m "not slow" tests
 

@@ -1,5 +1,5 @@
-"""Fixtures that several files use; in every test the library's annotations are checked, shapes by
-jaxtyping and types by beartype."""
+"""Fixtures that several files use. In each file of tests the library's annotations are checked in
+the first calls of each function, shapes by jaxtyping and types by beartype."""
 
 import contextlib
 import os

@@ -142,7 +142,7 @@ def replaced(name, content):
         (
             "nerfstudio",
             edited(lambda c: [f.pop("depth_file_path") for f in c["frames"]]),
-            "none of 8 frames has depth",
+            "none of 8 frames can be used: .*frame 0: no depth_file_path",
         ),
         ("nerfstudio", edited(lambda c: c.update(w=31.5)), "multiple of 1"),
         (
@@ -153,7 +153,7 @@ def replaced(name, content):
         (
             "lists",
             replaced("poses.txt", "1 0 0 0 0 1 0 0 0 0 1 0\n"),
-            r"rgb.txt, depth.txt, poses.txt and .* have \[8, 8, 1, 1\] lines",
+            r"rgb.txt, depth.txt, poses.txt and .* have \[8, 8, 1, 8\] lines",
         ),
         (
             "lists",

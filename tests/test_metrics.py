@@ -84,7 +84,7 @@ def test_the_interval_of_an_accuracy_matches_the_binomial():
 
 
 def test_equal_errors_have_no_spread():
-    summary = figures_of([20.0] * 5)
+    summary = figures_of([20.0] * 5, np.ones((3, 5)))
     assert summary["n"] == 5
     for name, value in {"median": 20, "acc30": 100, "acc15": 0, "above150": 0}.items():
         assert summary[name] == value
@@ -94,9 +94,11 @@ def test_equal_errors_have_no_spread():
 def test_errors_at_a_threshold_count_on_neither_side_of_it():
     # At thresholds below 15 one of four is right, up to 30 two: (25 + 50) / 2. An error of 30
     # counts nowhere.
-    assert figures_of([0.0, 15.0, 30.0, 60.0])["auc30"] == pytest.approx(37.5)
+    assert figures_of([0.0, 15.0, 30.0, 60.0], np.ones((3, 4)))["auc30"] == pytest.approx(37.5)
     # Two of five are above 150.
-    assert figures_of([10.0, 149.0, 150.0, 151.0, 180.0])["above150"] == pytest.approx(40)
+    assert figures_of([10.0, 149.0, 150.0, 151.0, 180.0], np.ones((3, 5)))[
+        "above150"
+    ] == pytest.approx(40)
 
 
 PAIRS = [("a", "b"), ("b", "c"), ("c", "d"), ("d", "a"), ("a", "c"), ("b", "d")]

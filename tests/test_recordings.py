@@ -181,7 +181,6 @@ def test_recorders_of_open3d_and_redwood_need_no_option(tmp_path, views):
     # Redwood's images are of 640 x 480 pixels. Depth has other times.
     redwood = tmp_path / "redwood"
     write(redwood, views[:3], "rgb/{:07d}-{:09d}000.jpg depth/{:07d}-{:09d}400.png", enlarge=4)
-    (redwood / "rgb.txt").touch()  # as in TUM's benchmark, whose poses are missing
     source = open_source(redwood)
     assert errors(source, views[:3])[0] < 1
     assert "PrimeSense" in flags(source)

@@ -30,10 +30,12 @@ def summarise(table: pd.DataFrame) -> dict[str, Any]:
     ours = table[table["row"] == "ours"]
     methods = {}
     against = {}
-    draws = {}  # by problems: rows of the same ones have the same
+    draws = {}  # of the rows with the same problems, which share them
     for name, row in table.groupby("row", sort=False):
         problems = tuple(row["problem"])
-        drawn = draws[problems] = draws[problems] if problems in draws else draws_of(row)
+        if problems not in draws:
+            draws[problems] = draws_of(row)
+        drawn = draws[problems]
         methods[name] = _summarise_row(row, drawn)
         common = ours[ours["repeat"].isin(row["repeat"])]
         if name != "ours" and row["problem"].tolist() == common["problem"].tolist():
@@ -87,7 +89,7 @@ def draws_of(row: pd.DataFrame) -> Draws:
     return drawn * of_seeds[:, repeat]
 
 
-def figures_of(errors: ArrayLike, weights: Draws | None = None) -> dict:
+def figures_of(errors: ArrayLike, weights: Draws) -> dict:
     """Compute the paper's figures of rotation errors (n,) in degrees, with 95 % intervals (see
     `bootstrap_ci`).
 

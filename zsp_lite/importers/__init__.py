@@ -16,9 +16,9 @@ from zsp_lite.importers.capture import (
     Makers,
     OutsideError,
     find_masks,
+    first_three,
     natural_order,
     sharpest,
-    some,
 )
 from zsp_lite.importers.files import PICTURES
 from zsp_lite.importers.lists import read_lists, read_tum
@@ -73,7 +73,7 @@ FORMATS = {
         ("intrinsics",),
         # Signs of other formats: poses that they have are not to be found again.
         unless=(
-            *("scene*", "pose", "groundtruth.txt", "trajectory.log", "depth/*.exr"),
+            *("scene*", "pose", "groundtruth.txt", "rgb.txt", "trajectory.log", "depth/*.exr"),
             *_COLMAP,
         ),
     ),
@@ -121,7 +121,7 @@ _OTHERS = (
     (
         ("rgb.txt", "depth.txt", "depth"),
         "has images and depth, but no poses (groundtruth.txt, poses.txt, pose/, ...)",
-        _HOW,
+        "expected their file; or rgb/ and depth/ in millimetres alone, whose poses are found",
     ),
     (("*.sens",), "is ScanNet's packed scan", "expected it unpacked by ScanNet's SensReader"),
     (
@@ -233,8 +233,7 @@ def open_capture(
         except OutsideError:
             raise
         except (InputError, OSError) as error:  # OSError for a name that is too long
-            # A zip is unpacked to a temporary folder.
-            left_out.append(str(error).replace(f"{folder.parent}/", ""))
+            left_out.append(str(error))
     frames.sort(key=lambda frame: natural_order(frame.image))
 
     # The number of a frame is the last one in its image's name, or 0; of a long number, the last 15
@@ -263,9 +262,11 @@ def open_capture(
 
     sharp = sharpest(frames, count, lambda frame: frame.load().rgb, left_out)
     frames = [frame for frame, _ in sharp]
+    # Of a zip, the folder's parent is a temporary folder.
+    left_out = [problem.replace(f"{folder.parent}{os.sep}", "") for problem in left_out]
     if not frames:
         raise InputError(
             f"capture {folder.resolve().name}: none of {len(left_out)} frames can be used: "
-            f"{some(left_out)}"
+            f"{first_three(left_out) or 'it lists none'}"
         )
     return Capture(frames, left_out)

@@ -283,7 +283,7 @@ def _scaled(factor: float, distance: float, unit: float | None) -> str:
     if not unit:
         return f"the depth is multiplied by {factor:.3g}"
     new = factor * unit
-    # A unit within 4 % of a usual one, but for that of now, is that.
+    # A unit within 4 % of a usual one is taken for that one, unless it is the present unit.
     new = next((one for one in _UNITS if abs(one / new - 1) < 0.04 and one != unit), new)
     # The depth is right if its factor would make a plausible distance of the object implausible.
     nearest, farthest = PLAUSIBLE

@@ -29,7 +29,8 @@ from zsp_lite.io.files import read_bytes, shown
 
 # OpenCV's and Open3D's pixel centres are at integers: their principal points are smaller by this.
 HALF_PIXEL = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
-# The camera of TUM's benchmark and of Redwood's scans, where none is given.
+# The camera of TUM's benchmark and of Redwood's scans, where none is given; pixel centres at
+# half-integers.
 PRIMESENSE = {
     "intrinsics": (525.0, 525.0, 320.0, 240.0),
     "doubt": "no --intrinsics FX,FY,CX,CY: the camera is taken for TUM's and Redwood's PrimeSense",
@@ -66,7 +67,7 @@ class CaptureFrame:
     # its EXIF orientation; None if their sizes show it (see `files.lies_as_stored`).
     orientation: str | None = None
     posed: bool = True  # False for a single image, whose world is its camera's frame
-    doubt: str = ""  # why the image may be that of another frame
+    doubt: str = ""  # what may be wrong: camera, pose, or which image it is
     number: int = 0  # the last in the image's name, or else the position
 
     def load(self) -> Frame:
@@ -180,7 +181,7 @@ def make_frame(
     )
 
 
-def some(problems: Iterable[str]) -> str:
+def first_three(problems: Iterable[str]) -> str:
     """List three different problems, and count the others."""
     different = list(dict.fromkeys(problems))
     more = f"; and {len(different) - 3} more" if len(different) > 3 else ""

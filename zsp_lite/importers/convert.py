@@ -14,7 +14,7 @@ from zsp_lite.data.frames import Frame, frame_defect
 from zsp_lite.data.writing import SequenceData, write_co3d
 from zsp_lite.errors import InputError
 from zsp_lite.importers import PACKED
-from zsp_lite.importers.capture import HALF_PIXEL, some
+from zsp_lite.importers.capture import HALF_PIXEL, first_three
 from zsp_lite.importers.sources import Source, open_source
 from zsp_lite.io.files import plain_name
 from zsp_lite.points import axis_deviation, object_pixels, sampling_step, world_points
@@ -71,7 +71,7 @@ def import_source(source: Source, root: str | Path, category: str, sequence: str
     if left_out and len(seen) < MIN_VIEWS:
         raise InputError(
             f"{source.path}: {len(seen)} of {len(seen) + len(left_out)} frames remain, expected "
-            f"{MIN_VIEWS}: {'; '.join(filter(None, (*source.doubts, some(left_out))))}"
+            f"{MIN_VIEWS}: {'; '.join(filter(None, (*source.doubts, first_three(left_out))))}"
         )
     frames = LazyFrames(source.read_frame, seen)
     points, colours, normals = fuse(frames)

@@ -34,7 +34,7 @@ def read_lists(folder: Path) -> Makers:
             "lines, or fx, fy, cx, cy in each"
         )
     if intrinsics.shape[1] == 3 or len(intrinsics) == 1:
-        intrinsics = [intrinsics.squeeze()] * len(poses)
+        intrinsics = [intrinsics.squeeze()] * len(images)
     if len(set(images)) < len(images):
         raise InputError(f"{folder}/rgb.txt names a picture twice, expected another in each line")
     lines = [len(images), len(depths), len(poses), len(intrinsics)]

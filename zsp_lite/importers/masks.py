@@ -147,7 +147,8 @@ def separate_colours(
 ) -> Bool[np.ndarray, "h w"]:
     """Select the foreground by GrabCut: the `certain` pixels, and some of the `possible` ones.
 
-    It sees a copy whose longer side has at most `longest` pixels: its time goes with the area.
+    It works on a copy whose longer side has at most `longest` pixels: its time is proportional to
+    the area.
     """
     height, width = possible.shape
     labels = np.where(possible, cv2.GC_PR_FGD, cv2.GC_BGD)
@@ -476,8 +477,9 @@ def _colours_around(
     possible = np.zeros_like(mask)
     possible[inner] = frame.depth[inner] == 0 if certain else True
     separated = np.zeros_like(mask)
+    # Coarser than from a box alone: depth tells most of it.
     separated[context] = separate_colours(
-        frame.rgb[context], possible[context], mask[context] & certain, 160
+        frame.rgb[context], possible[context], mask[context] & certain, longest=160
     )
     return separated
 

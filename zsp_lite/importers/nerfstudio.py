@@ -15,6 +15,7 @@ from zsp_lite.importers.capture import (
     convert_plain,
     find_inside,
     make_frame,
+    refuse,
 )
 from zsp_lite.importers.files import picture_size
 from zsp_lite.io.files import read_json
@@ -67,18 +68,12 @@ def read_nerfstudio(path: str | Path) -> Makers:
         path = next((path / name for name in _NAMES if (path / name).is_file()), path / _NAMES[0])
     common = read_json(path, dict[str, Any], "capture")
     listed = convert_plain(common.pop("frames", None), list[dict[str, Any]], f"{path}, frames")
-    with_depth = [
-        k
-        for k, frame in enumerate(listed)
-        if frame.get("depth_file_path") or frame.get("depth_path")
-    ]
-    if not with_depth:
-        raise InputError(
-            f"{path}: none of {len(listed)} frames has depth_file_path or depth_path, "
-            "expected depth"
-        )
-    for number in with_depth:
-        yield partial(_make, path.parent, common | listed[number], f"{path}, frame {number}")
+    for number, frame in enumerate(listed):
+        where = f"{path}, frame {number}"
+        if frame.get("depth_file_path") or frame.get("depth_path"):
+            yield partial(_make, path.parent, common | frame, where)
+        else:
+            yield partial(refuse, f"{where}: no depth_file_path or depth_path")
 
 
 def _make(folder: Path, values: dict[str, Any], where: str) -> CaptureFrame:

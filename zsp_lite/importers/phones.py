@@ -153,8 +153,9 @@ def read_record3d(folder: Path) -> Makers:
     for number in range(len(scan.poses)):
         intrinsics = every[number] if number < len(every) else []
         yield partial(_make_record3d, folder, unpacked / f"{number}", scan, intrinsics)
-    for number in range(len(scan.poses), len([*folder.glob("rgbd/*.jpg")])):
-        yield partial(refuse, f"rgbd/{number}.jpg: no pose in metadata")
+    for path in folder.glob("rgbd/*.jpg"):
+        if path.stem not in map(str, range(len(scan.poses))):
+            yield partial(refuse, f"rgbd/{path.name}: no pose in metadata")
 
 
 def _make_record3d(

@@ -60,11 +60,16 @@ def read_recording(
     image = min(images.values())  # any of them tells
     if intrinsics is not None:
         camera = {"intrinsics": intrinsics}
+    elif any(folder.glob("*intrinsic.json")):
+        camera = open3d_camera(folder)
     # Redwood's images are named FRAME-TIME.
     elif re.fullmatch(r"\d+-\d+", image.stem) and files.picture_size(image) == (480, 640):
         camera = PRIMESENSE
     else:
-        camera = open3d_camera(folder)
+        raise InputError(
+            f"{folder} has no intrinsics, expected --intrinsics FX,FY,CX,CY in pixels, or Open3D's "
+            "intrinsic.json"
+        )
     # The numbers are of frames or times: an image and its depth have the same, or nearly. They
     # differ by at most 3/4 of the mean distance between images.
     numbers = np.array([*depths])
@@ -107,12 +112,7 @@ def _numbered(folder: Path, name: str) -> dict[float, Path]:
 def open3d_camera(folder: Path) -> dict[str, Any]:
     """Read the intrinsics, stored in column-major order, and the distortion of Open3D's
     recorders."""
-    path = next(folder.glob("*intrinsic.json"), None)  # camera_intrinsic.json of its examples
-    if not path:
-        raise InputError(
-            f"{folder} has no intrinsics, expected --intrinsics FX,FY,CX,CY in pixels, or Open3D's "
-            "intrinsic.json"
-        )
+    path = max(folder.glob("*intrinsic.json"))  # Open3D's examples write camera_intrinsic.json
     camera = read_json(path, dict[str, Any], "capture")
     matrix = real_array(f"{path}: intrinsic_matrix", camera.get("intrinsic_matrix"), (9,))
     return {
@@ -236,9 +236,10 @@ def _track(makers: list[Callable[..., CaptureFrame]], name: str) -> Makers:
     )
     # Open3D has removed loops that contradict the rest.
     closed = sum(edge.uncertain for edge in graph.edges)
-    doubt = {}
+    doubt = makers[0].keywords.get("doubt", "")
     if closed < len(loops) / 4:
-        doubt["doubt"] = f"the poses may drift: {closed} of {len(loops)} loops close"
+        drift = f"the poses may drift: {closed} of {len(loops)} loops close"
+        doubt = f"{doubt}; {drift}" if doubt else drift
     for position, node in zip(order, graph.nodes):
         # The translation, the last column, back in the units of the depth.
-        yield partial(makers[position], node.pose[:3] * [1, 1, 1, unit], **doubt)
+        yield partial(makers[position], node.pose[:3] * [1, 1, 1, unit], doubt=doubt)

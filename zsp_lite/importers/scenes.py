@@ -43,8 +43,8 @@ def read_bop(folder: Path, object: int | None = None) -> Makers:
             "--object N"
         )
     for image, objects in numbers.items():
-        if object in objects and image in cameras:
-            yield partial(_make_bop, folder, image, object, scene[image], cameras[image])
+        if object in objects:
+            yield partial(_make_bop, folder, image, object, scene[image], cameras.get(image, {}))
 
 
 def _make_bop(

@@ -17,7 +17,7 @@ from zsp_lite.data.frames import ON_OBJECT, Frame, frame_defect, list_frames
 from zsp_lite.errors import Doubt, InputError, check_choice
 from zsp_lite.importers import FORMATS, open_capture, recognise
 from zsp_lite.importers.agreement import disagreement, neighbours
-from zsp_lite.importers.capture import CaptureFrame, some
+from zsp_lite.importers.capture import CaptureFrame, first_three
 from zsp_lite.importers.files import (
     CO3D_DEPTH,
     DEPTHS,
@@ -71,7 +71,7 @@ class Source:
     left_out: Sequence[str] = ()  # for each frame that cannot be used, what is wrong with it
     # Names of the frames that come without a mask, by position.
     missing: Mapping[int, str] = field(default_factory=dict)
-    # Reasons to doubt the intrinsics or the order of the images; "" is none.
+    # Reasons to doubt the intrinsics, the poses or the order of the images; "" is none.
     doubts: Sequence[str] = ()
     depth_unit: float | None = None  # world units per stored depth value, of an image or a capture
     # Direction up in the world, zeros if it is not to be used; "floor" if `upright` is to find it.
@@ -169,7 +169,7 @@ class Source:
         """List doubts about the masks and depth of frames, and the intrinsics and poses of all."""
         flags = []
         if self.left_out:
-            flags.append(f"frames left out: {len(self.left_out)}: {some(self.left_out)}")
+            flags.append(f"frames left out: {len(self.left_out)}: {first_three(self.left_out)}")
         flags += depth_flags(frames, metric=self.format != "sequence")
         flags += map(Doubt, self.doubts)
         if self.mask == "given":
@@ -343,7 +343,7 @@ def _from_frames(frames: Sequence[Frame], path: Path) -> Source:
         else:
             used[number] = frame
     if not used:
-        raise InputError(f"no frame can be used: {some(left_out)}")
+        raise InputError(f"no frame can be used: {first_three(left_out)}")
     _check_poses([frame.camera for frame in used.values()], "in memory")
     return Source(
         path,
