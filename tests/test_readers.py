@@ -573,8 +573,10 @@ def test_a_scan_of_record3d_without_tracking_is_refused(tmp_path):
     metadata = {"K": [1.0] * 9, "dw": 4, "dh": 4, "poses": [[0.0] * 7] * 3}
     (tmp_path / "rgbd").mkdir()
     (tmp_path / "metadata").write_text(json.dumps(metadata))
+    refused("/metadata: all 3 poses are zero: the tracking", open_source, tmp_path)
+    (tmp_path / "metadata").write_text("{")
     zipped = shutil.make_archive(tmp_path / "cup", "zip", tmp_path)
-    refused("^cup.zip/metadata: all 3 poses are zero: the tracking", open_source, zipped)
+    refused("^capture cup.zip.metadata: ", open_source, zipped)
 
 
 # A disc before a wall, in metres, whose depth map is low-pass filtered: its silhouette is smeared.

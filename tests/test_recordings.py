@@ -6,7 +6,6 @@ import re
 import shutil
 from dataclasses import replace
 from functools import partial
-from tempfile import gettempdir
 
 import numpy as np
 import open3d as o3d
@@ -121,11 +120,10 @@ def test_frames_that_are_dark_or_damaged_are_left_out(tmp_path, views):
     # Frames 3, 5 and 6 are bad.
     assert errors(source, [*views[:3], views[4]])[0] < 1
     left_out = " ".join(source.left_out)
-    assert gettempdir() not in left_out  # where the zip is unpacked
     for reason in (
         "000003.jpg on, 1 of 6 do not join",
         "000005.jpg",
-        "000006.jpg: no depth of its number",
+        "(^| )scan.zip.rgb.000006.jpg: no depth of its number",  # not the temporary folder
     ):
         assert re.search(reason, left_out)
 

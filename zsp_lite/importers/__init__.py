@@ -121,7 +121,8 @@ _OTHERS = (
     (
         ("rgb.txt", "depth.txt", "depth"),
         "has images and depth, but no poses (groundtruth.txt, poses.txt, pose/, ...)",
-        "expected their file; or rgb/ and depth/ in millimetres alone, whose poses are found",
+        "expected their file; or rgb/ and depth/ alone, in millimetres or --depth-unit, whose "
+        "poses are found",
     ),
     (("*.sens",), "is ScanNet's packed scan", "expected it unpacked by ScanNet's SensReader"),
     (
@@ -226,14 +227,19 @@ def open_capture(
         options["attributes"] = attributes
     frames = []
     left_out = []
-    for make in FORMATS[layout].read(folder, **options):
-        try:
-            frames.append(make())
-        # A path out of the folder is no mistake of one frame: nothing of such a capture is read.
-        except OutsideError:
-            raise
-        except (InputError, OSError) as error:  # OSError for a name that is too long
-            left_out.append(str(error))
+    parent = f"{folder.parent}{os.sep}"  # of a zip, a temporary folder
+    try:
+        for make in FORMATS[layout].read(folder, **options):
+            try:
+                frames.append(make())
+            # A path out of the folder is no mistake of one frame: nothing of such a capture is
+            # read.
+            except OutsideError:
+                raise
+            except (InputError, OSError) as error:  # OSError for a name that is too long
+                left_out.append(str(error))
+    except InputError as error:
+        raise InputError(str(error).replace(parent, "")) from error
     frames.sort(key=lambda frame: natural_order(frame.image))
 
     # The number of a frame is the last one in its image's name, or 0; of a long number, the last 15
@@ -262,8 +268,7 @@ def open_capture(
 
     sharp = sharpest(frames, count, lambda frame: frame.load().rgb, left_out)
     frames = [frame for frame, _ in sharp]
-    # Of a zip, the folder's parent is a temporary folder.
-    left_out = [problem.replace(f"{folder.parent}{os.sep}", "") for problem in left_out]
+    left_out = [problem.replace(parent, "") for problem in left_out]
     if not frames:
         raise InputError(
             f"capture {folder.resolve().name}: none of {len(left_out)} frames can be used: "

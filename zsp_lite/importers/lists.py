@@ -37,7 +37,7 @@ def read_lists(folder: Path) -> Makers:
         intrinsics = [intrinsics.squeeze()] * len(images)
     if len(set(images)) < len(images):
         raise InputError(f"{folder}/rgb.txt names a picture twice, expected another in each line")
-    lines = [len(images), len(depths), len(poses), len(intrinsics)]
+    lines = [*map(len, (images, depths, poses, intrinsics))]
     if len(set(lines)) > 1:
         raise InputError(
             f"capture {folder}: rgb.txt, depth.txt, poses.txt and the intrinsics have {lines} "

@@ -15,7 +15,6 @@ from zsp_lite.importers.capture import (
     convert_plain,
     find_inside,
     make_frame,
-    refuse,
 )
 from zsp_lite.importers.files import picture_size
 from zsp_lite.io.files import read_json
@@ -69,16 +68,15 @@ def read_nerfstudio(path: str | Path) -> Makers:
     common = read_json(path, dict[str, Any], "capture")
     listed = convert_plain(common.pop("frames", None), list[dict[str, Any]], f"{path}, frames")
     for number, frame in enumerate(listed):
-        where = f"{path}, frame {number}"
-        if frame.get("depth_file_path") or frame.get("depth_path"):
-            yield partial(_make, path.parent, common | frame, where)
-        else:
-            yield partial(refuse, f"{where}: no depth_file_path or depth_path")
+        yield partial(_make, path.parent, common | frame, f"{path}, frame {number}")
 
 
 def _make(folder: Path, values: dict[str, Any], where: str) -> CaptureFrame:
     """Make a frame from its values, those of all frames included."""
     frame = convert_plain(values, _Frame, where)
+    depth = frame.depth_file_path or frame.depth_path
+    if not depth:
+        raise InputError(f"{where}: no depth_file_path or depth_path")
     fisheye = frame.camera_model == _FISHEYE
     if not fisheye and (frame.camera_model not in _MODELS or frame.k4):
         raise InputError(
@@ -94,7 +92,7 @@ def _make(folder: Path, values: dict[str, Any], where: str) -> CaptureFrame:
     return make_frame(
         folder,
         frame.file_path,
-        frame.depth_file_path or frame.depth_path,
+        depth,
         frame.transform_matrix,
         _intrinsics(frame, *size, where),
         where,
