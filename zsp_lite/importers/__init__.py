@@ -1,11 +1,13 @@
 """Import of RGB-D captures: formats, object masks, and sequences in CO3D's layout."""
 
 import os
+import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from fnmatch import fnmatch
 from itertools import product
 from pathlib import Path
+from tempfile import gettempdir
 from typing import Any, Literal
 
 from zsp_lite.data.annotations import FRAMES_FILE
@@ -227,7 +229,8 @@ def open_capture(
         options["attributes"] = attributes
     frames = []
     left_out = []
-    parent = f"{folder.parent}{os.sep}"  # of a zip, a temporary folder
+    # The folder to which a zip is unpacked.
+    unpacked = re.compile(rf"{re.escape(gettempdir())}.zsp-lite-\w+.")
     try:
         for make in FORMATS[layout].read(folder, **options):
             try:
@@ -239,7 +242,7 @@ def open_capture(
             except (InputError, OSError) as error:  # OSError for a name that is too long
                 left_out.append(str(error))
     except InputError as error:
-        raise InputError(str(error).replace(parent, "")) from error
+        raise InputError(unpacked.sub("", str(error))) from error
     frames.sort(key=lambda frame: natural_order(frame.image))
 
     # The number of a frame is the last one in its image's name, or 0; of a long number, the last 15
@@ -268,7 +271,7 @@ def open_capture(
 
     sharp = sharpest(frames, count, lambda frame: frame.load().rgb, left_out)
     frames = [frame for frame, _ in sharp]
-    left_out = [problem.replace(parent, "") for problem in left_out]
+    left_out = [unpacked.sub("", problem) for problem in left_out]
     if not frames:
         raise InputError(
             f"capture {folder.resolve().name}: none of {len(left_out)} frames can be used: "
