@@ -65,9 +65,9 @@ def bootstrap_ci(
     return interval_of(statistic(errors, weights))
 
 
-def interval_of(replicates: Float[np.ndarray, " resamples"]) -> list[float]:
-    """Return the ends of the interval that holds 95 % of the replicates."""
-    return np.percentile(replicates, [2.5, 97.5]).tolist()
+def interval_of(replicates: Float[np.ndarray, "*figures resamples"]) -> list:
+    """Return the ends of the interval that holds 95 % of the replicates, of each figure."""
+    return np.percentile(replicates, [2.5, 97.5], axis=-1).T.tolist()
 
 
 def multiplicities(

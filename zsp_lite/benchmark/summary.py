@@ -1,19 +1,13 @@
 """Figures of a run (paper sec. 5.1) with their intervals, and tests of differences."""
 
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import pandas as pd
+from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from zsp_lite.benchmark.statistics import (
-    Draws,
-    bootstrap_ci,
-    interval_of,
-    multiplicities,
-    object_draws,
-)
+from zsp_lite.benchmark.statistics import Draws, interval_of, multiplicities, object_draws
 from zsp_lite.metrics import accuracy, median, weighted_mean
 
 
@@ -58,8 +52,9 @@ def _summarise_row(row: pd.DataFrame, drawn: Draws) -> dict[str, Any]:
     drawn_medians = []  # of each category by draw
     for category in np.unique(categories).tolist():
         members = categories == category
-        summary["per_category"][category] = figures_of(errors[members], drawn[:, members])
-        drawn_medians.append(median(errors[members], drawn[:, members]))
+        replicates = _statistics(errors[members], drawn[:, members])
+        summary["per_category"][category] = _figures(errors[members], replicates)
+        drawn_medians.append(replicates[0])
     medians = [figures["median"] for figures in summary["per_category"].values()]
     summary["mean_category_median"] = float(np.mean(medians))
     summary["mean_category_median_ci"] = interval_of(np.mean(drawn_medians, axis=0))
@@ -98,21 +93,30 @@ def figures_of(errors: ArrayLike, weights: Draws) -> dict:
     percent.
     """
     errors = np.asarray(errors, np.float64)
-    values: dict[str, Any] = {"n": int(errors.size)}
-    for name, figure in _FIGURES.items():
-        values[name] = float(figure(errors, None))
-        values[f"{name}_ci"] = bootstrap_ci(errors, figure, weights)
-    return values
+    return _figures(errors, _statistics(errors, weights))
 
 
-# Statistics of errors (n,) with weights (resamples, n) or None.
-_FIGURES: dict[str, Callable[..., Any]] = {
-    "median": median,
-    "acc30": lambda errors, weights: accuracy(errors, 30, weights),
-    "acc15": lambda errors, weights: accuracy(errors, 15, weights),
-    "above150": lambda errors, weights: 100 * weighted_mean(errors > 150, weights),
-    "auc30": lambda errors, weights: 100 * weighted_mean((1 - errors / 30).clip(0), weights),
-}
+def _figures(
+    errors: Float[np.ndarray, " n"], replicates: Float[np.ndarray, "figures resamples"]
+) -> dict[str, Any]:
+    """Return the figures of errors with intervals, from the figures of each replicate."""
+    figures: dict[str, Any] = {"n": len(errors)}
+    values = _statistics(errors, np.ones((1, len(errors))))[:, 0].tolist()
+    for name, value, interval in zip(_FIGURES, values, interval_of(replicates)):
+        figures |= {name: value, f"{name}_ci": interval}
+    return figures
+
+
+_FIGURES = "median", "acc30", "acc15", "above150", "auc30"
+
+
+def _statistics(
+    errors: Float[np.ndarray, " n"], weights: Draws
+) -> Float[np.ndarray, "figures resamples"]:
+    """Return the figures of weighted errors, in the order of `_FIGURES`."""
+    shares = np.stack([errors < 30, errors < 15, errors > 150, (1 - errors / 30).clip(0)])
+    means = 100 * shares @ weights.T / weights.sum(axis=1)
+    return np.vstack([median(errors, weights), means])
 
 
 def paired_difference(first: ArrayLike, second: ArrayLike, weights: Draws) -> dict:

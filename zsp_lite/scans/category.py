@@ -57,7 +57,7 @@ _MARGIN = 2.52
 _NONE = -0.93
 _NONE_AGREEING = -3.03
 
-_Poses = Float[np.ndarray, "_ 4 4"]  # matrices of similarities
+_Poses = Float[np.ndarray, "*_ 4 4"]  # matrices of similarities
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,8 +159,9 @@ def synchronise(pairs: Sequence[PairHypotheses]) -> CategoryAlignment:
 
     # The two steps of the module's docstring.
     rng = np.random.default_rng(0)
-    found = [_search(own, _random_tree(votes, names, rng)) for _ in range(_STARTS)]
-    poses = max(found, key=lambda poses: sum(one.scores(one.options(poses))[0] for one in own))
+    found = _search(own, np.stack([_random_tree(votes, names, rng) for _ in range(_STARTS)]))
+    scores = sum(one.scores(one.options(found))[:, 0] for one in own)
+    poses = found[np.argmax(scores)]
     for _ in range(_AVERAGING_SWEEPS):
         for i, one in enumerate(own):
             poses[i] = one.mean(one.options(poses))
@@ -183,7 +184,7 @@ class _Votes(NamedTuple):
     """Hypotheses, each in both directions: k similarities from the world of one object to that of
     another, both objects at the origin.
 
-    The methods are for the votes on one object.
+    The methods are for the votes on one object, given poses (..., objects, 4, 4).
     """
 
     here: Int[np.ndarray, " k"]  # the object that a similarity starts from
@@ -194,21 +195,23 @@ class _Votes(NamedTuple):
 
     def options(self, poses: _Poses) -> _Poses:
         """Return the present pose of the object, and those that the votes propose."""
-        return np.concatenate([poses[self.here[:1]], poses[self.there] @ self.matrix])
+        proposed = poses[..., self.there, :, :] @ self.matrix
+        return np.concatenate([poses[..., self.here[:1], :, :], proposed], axis=-3)
 
-    def agreement(self, options: _Poses) -> Float[np.ndarray, "o k"]:
+    def agreement(self, options: _Poses) -> Float[np.ndarray, "*b o k"]:
         r"""Return \exp(\kappa (\cos\theta - 1)) of the options and the votes; \cos\theta = (trace -
         1) / 2."""
-        rotations = _split(options)[1].reshape(-1, 9)
-        return np.exp(KAPPA / 2 * (rotations @ rotations[1:].T - 3))
+        rotations = _split(options)[1].reshape(*options.shape[:-2], 9)
+        traces = rotations @ rotations[..., 1:, :].swapaxes(-1, -2)
+        return np.exp(KAPPA / 2 * (traces - 3))
 
     def by_pair(self) -> Float[np.ndarray, "d k"]:
         """Return the probabilities, in the rows of their pairs."""
         return (self.pair == np.unique(self.pair)[:, None]) * self.probability
 
-    def scores(self, options: _Poses) -> Float[np.ndarray, " o"]:
+    def scores(self, options: _Poses) -> Float[np.ndarray, "*b o"]:
         """Return the part of the objective that depends on the object, for each option."""
-        return np.log(FLOOR + self.agreement(options) @ self.by_pair().T).sum(axis=1)
+        return np.log(FLOOR + self.agreement(options) @ self.by_pair().T).sum(axis=-1)
 
     def mean(self, options: _Poses) -> Float[np.ndarray, "4 4"]:
         """Return the mean of the votes, weighted by the probability that each is its pair's right
@@ -217,9 +220,11 @@ class _Votes(NamedTuple):
         weight = (agreement / (FLOOR + agreement.sum(axis=1, keepdims=True))).sum(axis=0)
         weight /= weight.sum()
         scales, rotations = _split(options[1:])
-        rotation = nearest_rotation(np.tensordot(weight, rotations, 1)[None])[0][0]
-        scale = np.exp(weight @ np.log(scales))
-        return Sim3(scale, rotation, weight @ options[1:, :3, 3]).matrix
+        mean = np.eye(4)
+        mean[:3, :3] = nearest_rotation(np.tensordot(weight, rotations, 1)[None])[0][0]
+        mean[:3, :3] *= np.exp(weight @ np.log(scales))
+        mean[:3, 3] = weight @ options[1:, :3, 3]
+        return mean
 
 
 def _collect(
@@ -237,10 +242,10 @@ def _collect(
     return _Votes(*map(np.array, zip(*rows)))
 
 
-def _split(poses: _Poses) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n 3 3"]]:
+def _split(poses: _Poses) -> tuple[Float[np.ndarray, "*n"], Float[np.ndarray, "*n 3 3"]]:
     """Return the scales and the rotations of similarities."""
-    scales = np.cbrt(np.linalg.det(poses[:, :3, :3]))
-    return scales, poses[:, :3, :3] / scales[:, None, None]
+    scales = np.cbrt(np.linalg.det(poses[..., :3, :3]))
+    return scales, poses[..., :3, :3] / scales[..., None, None]
 
 
 def _random_tree(votes: _Votes, names: Sequence[str], rng: np.random.Generator) -> _Poses:
@@ -264,12 +269,14 @@ def _random_tree(votes: _Votes, names: Sequence[str], rng: np.random.Generator) 
 
 
 def _search(own: Sequence[_Votes], poses: _Poses) -> _Poses:
-    """Improve poses by the votes on one object after the other until nothing changes."""
+    """Improve the poses of each start by the votes on one object after the other until nothing
+    changes."""
     for _ in range(_SEARCH_SWEEPS):
         before = poses.copy()
         for i, votes in enumerate(own):
             options = votes.options(poses)
-            poses[i] = options[votes.scores(options).argmax()]
+            best = votes.scores(options).argmax(axis=1)
+            poses[:, i] = options[np.arange(len(poses)), best]
         if (poses == before).all():
             break
     return poses
