@@ -23,7 +23,6 @@ from zsp_lite.importers.segments import WINDOW_3, fit_plane, largest_region
 from zsp_lite.points import object_pixels, sampling_step, standard_deviation, world_points
 
 # Masks by colours.
-_ITERATIONS = 4  # number of GrabCut's iterations
 _PADDING = 0.1  # of the projected bounding box, relative to its longer side
 _SMALLEST_BOX = 4  # least side of a box, pixels
 # Distance of the ball's centre behind the visible surface, relative to the ball's radius.
@@ -144,11 +143,12 @@ def separate_colours(
     possible: Bool[np.ndarray, "h w"],
     certain: Bool[np.ndarray, "h w"] | bool = False,
     longest: int = 320,
+    iterations: int = 4,
 ) -> Bool[np.ndarray, "h w"]:
     """Select the foreground by GrabCut: the `certain` pixels, and some of the `possible` ones.
 
     It works on a copy whose longer side has at most `longest` pixels: its time is proportional to
-    the area.
+    the area and the iterations.
     """
     height, width = possible.shape
     labels = np.where(possible, cv2.GC_PR_FGD, cv2.GC_BGD)
@@ -163,7 +163,7 @@ def separate_colours(
         # GrabCut keeps five Gaussians of 13 numbers each in these arrays.
         background_model = np.zeros((1, 65))
         model = np.zeros((1, 65))
-        cv2.grabCut(bgr, small, None, background_model, model, _ITERATIONS, cv2.GC_INIT_WITH_MASK)
+        cv2.grabCut(bgr, small, None, background_model, model, iterations, cv2.GC_INIT_WITH_MASK)
     selected = np.isin(small, foreground).astype(np.float32)
     return cv2.resize(selected, (width, height), interpolation=cv2.INTER_LINEAR) > 0.5
 
@@ -478,9 +478,9 @@ def _colours_around(
     possible[inner] = frame.depth[inner] == 0 if certain else True
     separated = np.zeros_like(mask)
     # Coarser than from a box alone: depth tells most of it.
-    separated[context] = separate_colours(
-        frame.rgb[context], possible[context], mask[context] & certain, longest=160
-    )
+    coarse = {"longest": 160, "iterations": 2}
+    known = mask[context] & certain
+    separated[context] = separate_colours(frame.rgb[context], possible[context], known, **coarse)
     return separated
 
 
