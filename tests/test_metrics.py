@@ -13,7 +13,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from refusals import refused
 from scipy.spatial.transform import Rotation
 
-from zsp_lite.benchmark.statistics import bootstrap_ci, multiplicities, object_draws
+from zsp_lite.benchmark.statistics import interval_of, multiplicities, object_draws
 from zsp_lite.benchmark.summary import figures_of, paired_difference, summarise
 from zsp_lite.metrics import accuracy, median, rotation_error
 
@@ -60,10 +60,6 @@ def test_accuracy_counts_errors_strictly_below_the_threshold():
     assert median([1, 2, 100]) == 2
 
 
-def acc30(errors, weights=None):
-    return accuracy(errors, 30, weights)
-
-
 def test_weights_count_errors_several_times():
     rng = default_rng(0)
     for n in (1, 2, 7, 8):
@@ -79,8 +75,8 @@ def test_weights_count_errors_several_times():
 def test_the_interval_of_an_accuracy_matches_the_binomial():
     # 40 of 100 solved: the normal approximation gives 40 +- 1.96 * sqrt(.4 * .6 / 100) = 40 +- 9.6.
     errors = np.r_[np.zeros(40), np.full(60, 90.0)]
-    low, high = bootstrap_ci(errors, acc30)
-    assert_allclose((low, high), (30.4, 49.6), atol=1.5)
+    drawn = multiplicities(100, default_rng(0))
+    assert_allclose(interval_of(accuracy(errors, 30, drawn)), (30.4, 49.6), atol=1.5)
 
 
 def test_equal_errors_have_no_spread():

@@ -5,8 +5,6 @@ the intervals of this project. Draws are weights: a row for each bootstrap repli
 each pair.
 """
 
-from collections.abc import Callable
-
 import numpy as np
 from jaxtyping import Float, Int
 from numpy.typing import ArrayLike
@@ -51,22 +49,8 @@ def object_draws(objects: ArrayLike, categories: ArrayLike = "") -> Draws:
     return weights
 
 
-def bootstrap_ci(
-    errors: ArrayLike, statistic: Callable[..., np.ndarray], weights: Draws | None = None
-) -> list[float]:
-    """Compute the 95 % percentile bootstrap interval of a statistic, such as `median`.
-
-    It maps errors (n,) and weights (resamples, n) to (resamples,). Weights are those of
-    `object_draws`; by default pairs are drawn as if they were independent.
-    """
-    errors = np.asarray(errors, np.float64)
-    if weights is None:
-        weights = multiplicities(len(errors), np.random.default_rng(0))
-    return interval_of(statistic(errors, weights))
-
-
 def interval_of(replicates: Float[np.ndarray, "*figures resamples"]) -> list:
-    """Return the ends of the interval that holds 95 % of the replicates, of each figure."""
+    """Return the ends of the 95 % percentile bootstrap interval of each figure."""
     return np.percentile(replicates, [2.5, 97.5], axis=-1).T.tolist()
 
 

@@ -52,9 +52,8 @@ def _summarise_row(row: pd.DataFrame, drawn: Draws) -> dict[str, Any]:
     drawn_medians = []  # of each category by draw
     for category in np.unique(categories).tolist():
         members = categories == category
-        replicates = _statistics(errors[members], drawn[:, members])
-        summary["per_category"][category] = _figures(errors[members], replicates)
-        drawn_medians.append(replicates[0])
+        summary["per_category"][category] = figures_of(errors[members], drawn[:, members])
+        drawn_medians.append(median(errors[members], drawn[:, members]))
     medians = [figures["median"] for figures in summary["per_category"].values()]
     summary["mean_category_median"] = float(np.mean(medians))
     summary["mean_category_median_ci"] = interval_of(np.mean(drawn_medians, axis=0))
@@ -85,24 +84,17 @@ def draws_of(row: pd.DataFrame) -> Draws:
 
 
 def figures_of(errors: ArrayLike, weights: Draws) -> dict:
-    """Compute the paper's figures of rotation errors (n,) in degrees, with 95 % intervals (see
-    `bootstrap_ci`).
+    """Compute the paper's figures of rotation errors (n,) in degrees, with 95 % intervals.
 
     "above150" is the percentage of errors above 150 degrees, mostly confusions of front and back;
     "auc30" the area under the curve of accuracy against the threshold from 0 to 30 degrees, in
     percent.
     """
     errors = np.asarray(errors, np.float64)
-    return _figures(errors, _statistics(errors, weights))
-
-
-def _figures(
-    errors: Float[np.ndarray, " n"], replicates: Float[np.ndarray, "figures resamples"]
-) -> dict[str, Any]:
-    """Return the figures of errors with intervals, from the figures of each replicate."""
-    figures: dict[str, Any] = {"n": len(errors)}
     values = _statistics(errors, np.ones((1, len(errors))))[:, 0].tolist()
-    for name, value, interval in zip(_FIGURES, values, interval_of(replicates)):
+    intervals = interval_of(_statistics(errors, weights))
+    figures: dict[str, Any] = {"n": len(errors)}
+    for name, value, interval in zip(_FIGURES, values, intervals):
         figures |= {name: value, f"{name}_ci": interval}
     return figures
 

@@ -154,10 +154,10 @@ def separate_colours(
     labels = np.where(possible, cv2.GC_PR_FGD, cv2.GC_BGD)
     labels = np.where(certain, cv2.GC_FGD, labels).astype(np.uint8)
     shrink = max(1, max(height, width) / longest)
-    size = (max(1, round(width / shrink)), max(1, round(height / shrink)))
+    size = max(1, round(width / shrink)), max(1, round(height / shrink))
     bgr = cv2.resize(rgb[..., ::-1], size, interpolation=cv2.INTER_AREA)
     small = cv2.resize(labels, size, interpolation=cv2.INTER_NEAREST_EXACT)
-    foreground = (cv2.GC_FGD, cv2.GC_PR_FGD)
+    foreground = cv2.GC_FGD, cv2.GC_PR_FGD
     if 0 < np.isin(small, foreground).mean() < 1:  # GrabCut needs pixels of both kinds
         cv2.setRNGSeed(0)  # GrabCut initialises its clusters at random
         # GrabCut keeps five Gaussians of 13 numbers each in these arrays.
@@ -478,9 +478,9 @@ def _colours_around(
     possible[inner] = frame.depth[inner] == 0 if certain else True
     separated = np.zeros_like(mask)
     # Coarser than from a box alone: depth tells most of it.
-    coarse = {"longest": 160, "iterations": 2}
-    known = mask[context] & certain
-    separated[context] = separate_colours(frame.rgb[context], possible[context], known, **coarse)
+    separated[context] = separate_colours(
+        frame.rgb[context], possible[context], mask[context] & certain, 160, 2
+    )
     return separated
 
 

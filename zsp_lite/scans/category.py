@@ -48,7 +48,7 @@ FLOOR = 0.1
 _ALL_PAIRS_BELOW = 12
 _PAIRS_PER_OBJECT = 6
 _STARTS = 48  # of the search, of which the best result is kept
-_SEARCH_SWEEPS = 8  # over all objects, at most
+_SEARCH_SWEEPS = 8  # over all objects
 _AVERAGING_SWEEPS = 30
 # Coefficients of the logit in `_judge`: of the margin, of the case that no rotation is right, and
 # of the share of agreeing pairs in this case. Fitted on validation categories to sets of
@@ -160,8 +160,7 @@ def synchronise(pairs: Sequence[PairHypotheses]) -> CategoryAlignment:
     # The two steps of the module's docstring.
     rng = np.random.default_rng(0)
     found = _search(own, np.stack([_random_tree(votes, names, rng) for _ in range(_STARTS)]))
-    scores = sum(one.scores(one.options(found))[:, 0] for one in own)
-    poses = found[np.argmax(scores)]
+    poses = found[sum(one.scores(one.options(found))[:, 0] for one in own).argmax()]
     for _ in range(_AVERAGING_SWEEPS):
         for i, one in enumerate(own):
             poses[i] = one.mean(one.options(poses))
@@ -180,6 +179,14 @@ def _to_centre(name: str, pairs: Sequence[PairHypotheses]) -> Sim3:
     return Sim3(1.0, np.eye(3), -np.median(centres, axis=0))
 
 
+def agreement(
+    turns: Float[np.ndarray, "*b m 3 3"], others: Float[np.ndarray, "*b h 3 3"]
+) -> Float[np.ndarray, "*b m h"]:
+    r"""Return \exp(\kappa (\cos\theta - 1)) of rotations; \cos\theta = (trace - 1) / 2."""
+    traces = np.einsum("...mij,...hij->...mh", turns, others)
+    return np.exp(KAPPA / 2 * (traces - 3))
+
+
 class _Votes(NamedTuple):
     """Hypotheses, each in both directions: k similarities from the world of one object to that of
     another, both objects at the origin.
@@ -195,15 +202,8 @@ class _Votes(NamedTuple):
 
     def options(self, poses: _Poses) -> _Poses:
         """Return the present pose of the object, and those that the votes propose."""
-        proposed = poses[..., self.there, :, :] @ self.matrix
-        return np.concatenate([poses[..., self.here[:1], :, :], proposed], axis=-3)
-
-    def agreement(self, options: _Poses) -> Float[np.ndarray, "*b o k"]:
-        r"""Return \exp(\kappa (\cos\theta - 1)) of the options and the votes; \cos\theta = (trace -
-        1) / 2."""
-        rotations = _split(options)[1].reshape(*options.shape[:-2], 9)
-        traces = rotations @ rotations[..., 1:, :].swapaxes(-1, -2)
-        return np.exp(KAPPA / 2 * (traces - 3))
+        proposed = poses.take(self.there, -3) @ self.matrix
+        return np.concatenate([poses.take(self.here[:1], -3), proposed], -3)
 
     def by_pair(self) -> Float[np.ndarray, "d k"]:
         """Return the probabilities, in the rows of their pairs."""
@@ -211,20 +211,20 @@ class _Votes(NamedTuple):
 
     def scores(self, options: _Poses) -> Float[np.ndarray, "*b o"]:
         """Return the part of the objective that depends on the object, for each option."""
-        return np.log(FLOOR + self.agreement(options) @ self.by_pair().T).sum(axis=-1)
+        rotations = _split(options)[1]
+        agreeing = agreement(rotations, rotations[..., 1:, :, :]) @ self.by_pair().T
+        return np.log(FLOOR + agreeing).sum(-1)
 
     def mean(self, options: _Poses) -> Float[np.ndarray, "4 4"]:
         """Return the mean of the votes, weighted by the probability that each is its pair's right
         one."""
-        agreement = self.by_pair() * self.agreement(options)[0]
-        weight = (agreement / (FLOOR + agreement.sum(axis=1, keepdims=True))).sum(axis=0)
+        scales, rotations = _split(options)
+        agreeing = self.by_pair() * agreement(rotations[:1], rotations[1:])
+        weight = (agreeing / (FLOOR + agreeing.sum(axis=1, keepdims=True))).sum(0)
         weight /= weight.sum()
-        scales, rotations = _split(options[1:])
-        mean = np.eye(4)
-        mean[:3, :3] = nearest_rotation(np.tensordot(weight, rotations, 1)[None])[0][0]
-        mean[:3, :3] *= np.exp(weight @ np.log(scales))
-        mean[:3, 3] = weight @ options[1:, :3, 3]
-        return mean
+        rotation = nearest_rotation(np.tensordot(weight, rotations[1:], 1)[None])[0][0]
+        scale = np.exp(weight @ np.log(scales[1:]))
+        return Sim3(scale, rotation, weight @ options[1:, :3, 3]).matrix
 
 
 def _collect(
@@ -269,16 +269,12 @@ def _random_tree(votes: _Votes, names: Sequence[str], rng: np.random.Generator) 
 
 
 def _search(own: Sequence[_Votes], poses: _Poses) -> _Poses:
-    """Improve the poses of each start by the votes on one object after the other until nothing
-    changes."""
+    """Improve the poses of each start by the votes on one object after the other."""
     for _ in range(_SEARCH_SWEEPS):
-        before = poses.copy()
         for i, votes in enumerate(own):
             options = votes.options(poses)
             best = votes.scores(options).argmax(axis=1)
             poses[:, i] = options[np.arange(len(poses)), best]
-        if (poses == before).all():
-            break
     return poses
 
 

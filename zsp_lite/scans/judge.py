@@ -27,7 +27,7 @@ from scipy.special import softmax
 from zsp_lite.alignment import Sim3, nearest_rotation
 from zsp_lite.data.evaluation import spread
 from zsp_lite.metrics import rotation_angle, vector_angle
-from zsp_lite.scans.category import FLOOR, KAPPA, PairHypotheses
+from zsp_lite.scans.category import FLOOR, PairHypotheses, agreement
 from zsp_lite.scans.shapes import Shape, centred, chamfer_distance, compare_headings, refine
 from zsp_lite.verified.confidence import hidden_share, modes
 from zsp_lite.verified.poses import float_tensor, non_maximum_suppression
@@ -141,16 +141,11 @@ class Votes:
         # The probability of each hypothesis, in the row of its frame.
         self.weights = block_diag(*(answer.probabilities for answer in answers))
 
-    def agreement(self, turns: Float[np.ndarray, "m 3 3"]) -> Float[np.ndarray, "m h"]:
-        r"""Return \exp(\kappa (\cos\theta - 1)) of rotations and all hypotheses."""
-        trace = np.einsum("mij,hij->mh", turns, self.turns)
-        return np.exp(KAPPA / 2 * (trace - 3))
-
     def score(self, turns: Float[np.ndarray, "m 3 3"]) -> Float[np.ndarray, " m"]:
         """Return V of rotations, 0 without votes."""
         if not len(self.turns):
             return np.zeros(len(turns))
-        return np.log(FLOOR + self.agreement(turns) @ self.weights.T).mean(axis=1)
+        return np.log(FLOOR + agreement(turns, self.turns) @ self.weights.T).mean(axis=1)
 
     def different(self) -> Float[np.ndarray, "m 3 3"]:
         """Return the rotations of the best hypotheses that differ."""
@@ -163,7 +158,7 @@ class Votes:
     def mean(self, turn: Float[np.ndarray, "3 3"], aligned: Sim3) -> Sim3:
         """Return the mean of the hypotheses that agree with a rotation, and of the aligned
         shapes."""
-        weight = self.weights.sum(axis=0) * self.agreement(turn[None])[0]
+        weight = self.weights.sum(axis=0) * agreement(turn[None], self.turns)[0]
         total = np.tensordot(weight, self.matrices, 1) + _LEAST * aligned.matrix
         mean = total / (weight.sum() + _LEAST)
         linear = mean[:3, :3]
