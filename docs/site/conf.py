@@ -4,9 +4,6 @@ import sys
 import tomllib
 from pathlib import Path
 
-# jsonschema imports this package to check addresses, which takes seconds and is not needed.
-sys.modules["rfc3987_syntax"] = None
-
 # The repository is Sphinx's source folder, so that all relative links stay as they are.
 ROOT = Path(__file__).parents[2]
 sys.path[:0] = [str(ROOT), str(Path(__file__).parent)]

@@ -51,7 +51,8 @@ def object_draws(objects: ArrayLike, categories: ArrayLike = "") -> Draws:
 
 def interval_of(replicates: Float[np.ndarray, "*figures resamples"]) -> list:
     """Return the ends of the 95 % percentile bootstrap interval of each figure."""
-    return np.percentile(replicates, [2.5, 97.5], axis=-1).T.tolist()
+    ends = np.percentile(replicates, [2.5, 97.5], axis=-1)
+    return np.moveaxis(ends, 0, -1).tolist()
 
 
 def multiplicities(

@@ -148,7 +148,7 @@ def separate_colours(
     """Select the foreground by GrabCut: the `certain` pixels, and some of the `possible` ones.
 
     It works on a copy whose longer side has at most `longest` pixels: its time is proportional to
-    the area and the iterations.
+    the area and to the number of iterations.
     """
     height, width = possible.shape
     labels = np.where(possible, cv2.GC_PR_FGD, cv2.GC_BGD)
@@ -160,10 +160,9 @@ def separate_colours(
     foreground = cv2.GC_FGD, cv2.GC_PR_FGD
     if 0 < np.isin(small, foreground).mean() < 1:  # GrabCut needs pixels of both kinds
         cv2.setRNGSeed(0)  # GrabCut initialises its clusters at random
-        # GrabCut keeps five Gaussians of 13 numbers each in these arrays.
-        background_model = np.zeros((1, 65))
-        model = np.zeros((1, 65))
-        cv2.grabCut(bgr, small, None, background_model, model, iterations, cv2.GC_INIT_WITH_MASK)
+        # GrabCut keeps five Gaussians of 13 numbers each, for background and foreground.
+        models = np.zeros((2, 1, 65))
+        cv2.grabCut(bgr, small, None, *models, iterations, cv2.GC_INIT_WITH_MASK)
     selected = np.isin(small, foreground).astype(np.float32)
     return cv2.resize(selected, (width, height), interpolation=cv2.INTER_LINEAR) > 0.5
 
@@ -477,9 +476,9 @@ def _colours_around(
     possible = np.zeros_like(mask)
     possible[inner] = frame.depth[inner] == 0 if certain else True
     separated = np.zeros_like(mask)
-    # Coarser than from a box alone: depth tells most of it.
+    # Coarser, and with fewer iterations, than from a box alone: depth tells most of it.
     separated[context] = separate_colours(
-        frame.rgb[context], possible[context], mask[context] & certain, 160, 2
+        frame.rgb[context], possible[context], mask[context] & certain, longest=160, iterations=2
     )
     return separated
 

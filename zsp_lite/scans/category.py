@@ -182,7 +182,8 @@ def _to_centre(name: str, pairs: Sequence[PairHypotheses]) -> Sim3:
 def agreement(
     turns: Float[np.ndarray, "*b m 3 3"], others: Float[np.ndarray, "*b h 3 3"]
 ) -> Float[np.ndarray, "*b m h"]:
-    r"""Return \exp(\kappa (\cos\theta - 1)) of rotations; \cos\theta = (trace - 1) / 2."""
+    r"""Return \exp(\kappa (\cos\theta - 1)) of each rotation with each other one; \cos\theta =
+    (trace - 1) / 2."""
     traces = np.einsum("...mij,...hij->...mh", turns, others)
     return np.exp(KAPPA / 2 * (traces - 3))
 
@@ -191,7 +192,7 @@ class _Votes(NamedTuple):
     """Hypotheses, each in both directions: k similarities from the world of one object to that of
     another, both objects at the origin.
 
-    The methods are for the votes on one object, given poses (..., objects, 4, 4).
+    The methods are for the votes on one object.
     """
 
     here: Int[np.ndarray, " k"]  # the object that a similarity starts from
@@ -201,7 +202,8 @@ class _Votes(NamedTuple):
     matrix: _Poses
 
     def options(self, poses: _Poses) -> _Poses:
-        """Return the present pose of the object, and those that the votes propose."""
+        """Return the present pose of the object, and those that the votes propose, given poses
+        (..., objects, 4, 4)."""
         proposed = poses.take(self.there, -3) @ self.matrix
         return np.concatenate([poses.take(self.here[:1], -3), proposed], -3)
 
@@ -269,7 +271,7 @@ def _random_tree(votes: _Votes, names: Sequence[str], rng: np.random.Generator) 
 
 
 def _search(own: Sequence[_Votes], poses: _Poses) -> _Poses:
-    """Improve the poses of each start by the votes on one object after the other."""
+    """Improve the poses (starts, objects, 4, 4) by the votes on one object after the other."""
     for _ in range(_SEARCH_SWEEPS):
         for i, votes in enumerate(own):
             options = votes.options(poses)
